@@ -111,6 +111,9 @@ class PixelBlock:
     """The instrument's errors; None where the instrument counts as exact."""
     motion: BlockMotion | None = None
     """Changes by moves; None where the fit estimates none."""
+    functions: Array | None = None
+    """Smooth functions (K, N) of the pixel that derivatives to the media follow (``normal_equations.smoothed``); None
+    where derivatives are taken pixel by pixel."""
 
     @property
     def fitted_view(self) -> View:
@@ -185,6 +188,7 @@ def write_block(folder: Path, block: PixelBlock) -> StoredFile:
         held_out=block.held_out,
         **parts,
         **({} if block.cell is None else {"cell": block.cell}),
+        **({} if block.functions is None else {"functions": block.functions.astype(np.float32)}),
         **instrument,
         **motion,
     )
@@ -216,4 +220,5 @@ def read_block(stored: StoredFile) -> PixelBlock:
         cell,
         instrument,
         motion,
+        a["functions"].astype(float) if "functions" in a else None,
     )

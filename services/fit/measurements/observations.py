@@ -25,6 +25,7 @@ from services.fit.measurements.instrument.moves import Move
 from services.fit.measurements.levels import LevelReader, reduced_camera, whole_squares
 from services.fit.measurements.pixel_step import chosen_pixel_step
 from services.fit.measurements.slopes import image_slopes
+from services.fit.measurements.smooth_functions import smooth_functions
 from services.fit.measurements.surroundings import read_neighbours
 from services.fit.measurements.view_stack import ViewStack, comparison_cells, on_coarse_grid
 from services.fit.solve.losses import first_weights
@@ -326,7 +327,8 @@ def write_channel(
         )
         motion = None if (of_view := moved[view.camera.name]) is None else of_view.of(lights, pixels)
         cell = cells[view.camera.name][pixels]
-        block = PixelBlock(*measured, weight[cut], held_out, parts, cell, instrument_of_block, motion)
+        functions = smooth_functions(view.pixels[pixels]) if scene.boundary == "rough" else None
+        block = PixelBlock(*measured, weight[cut], held_out, parts, cell, instrument_of_block, motion, functions)
         return write_block(folder, block)
 
     def level(max_pixels: int | None) -> Level:

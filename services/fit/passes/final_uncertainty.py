@@ -195,6 +195,7 @@ def final_task(
         block.fit_weight.reshape(-1),
         len(block.reference),
         len(slopes.errors),
+        block.functions,
     )
     return sums, (*(one.trace for one in changes), trace_row("closing", task, start))
 

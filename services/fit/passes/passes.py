@@ -129,6 +129,7 @@ def jacobian_task(
         regions,
         len(differentiation.errors),
         sum(kind_of_error(name) == "shift" for name in differentiation.errors),
+        block.functions,
     )
     if differentiation.errors and block.motion is not None:
         equations = equations.without_noise(*slope_noise(block, differentiation.errors))

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.solve.curvature_noise import per_pixel
+from services.fit.solve.normal_equations import smoothed
 
 Array = NDArray[np.float64]
 
@@ -112,6 +113,7 @@ def final_sums(
     weight: Array,
     lights: int,
     errors: int = 0,
+    functions: Array | None = None,
 ) -> FinalSums:
     """Closing sums of one block of measurements, M = lights x pixels.
 
@@ -126,24 +128,36 @@ def final_sums(
         lights: number of lights.
         errors: number of coordinates, the last of all, that are instrument errors; their derivatives come from the
             renders of the residuals, as in ``normal_equations``.
+        functions: smooth functions (K, pixels) that J~ follows, as there.
     """
     mean, spread = 0.5 * (similar[0] + similar[1]), 0.5 * (similar[0] - similar[1])
+    is_error = np.arange(len(mean)) >= len(mean) - errors
+
+    # The smooth part Q of the tissue's rows, and of what these are multiplied with where their noise is summed.
+    def smooth(rows: Array) -> Array:
+        return smoothed(rows, weight, lights, functions)
+
+    def smooth_tissue(rows: Array) -> Array:
+        return rows if functions is None else np.where(is_error[:, None], rows, smooth(rows))
+
     true, true_spread = 0.5 * (exact[0] + exact[1]), 0.5 * (exact[0] - exact[1])
     true, true_spread = np.where(copied[:, None], mean, true), np.where(copied[:, None], spread, true_spread)
     own = np.where(copied[:, None], spread, 0.0)
-    m, d, e, f, o = (whiten.T @ rows for rows in (mean, spread, true, true_spread, own))
+    m, e, f, o = (whiten.T @ rows for rows in (smooth_tissue(mean), true, true_spread, own))
+    d, smooth_d = (whiten.T @ rows for rows in (spread, smooth_tissue(spread)))
 
     # Derivatives with respect to errors share the noise of the residuals' renders; all others have independent noise.
-    is_error = np.arange(len(mean)) >= len(mean) - errors
     apart, shared = (whiten.T @ np.where(chosen[:, None], spread, 0.0) for chosen in (~is_error, is_error))
+    smooth_apart = apart if functions is None else whiten.T @ np.where(is_error[:, None], 0.0, smooth(spread))
 
     # Products of J~ with a pair of renders summed over measurements, with their noise by pixels, as in the normal
     # equations.
     def with_noise(pair: tuple[Array, Array], is_residual: bool = False) -> tuple[Array, Array]:
         value, half = weight * 0.5 * (pair[0] + pair[1]), weight * 0.5 * (pair[0] - pair[1])
         common = shared if is_residual else np.zeros_like(shared)
+        smooth_value = weight * smooth(0.5 * (pair[0] + pair[1])[None])
         first, second, both = (
-            per_pixel(terms, lights) for terms in (m * half + common * value, apart * value, apart * half)
+            per_pixel(terms, lights) for terms in (m * half + common * value, apart * smooth_value, smooth_apart * half)
         )
         return m @ value - common @ half, first @ first.T + second @ second.T - both @ both.T
 
@@ -152,11 +166,11 @@ def final_sums(
 
     # The response. Where J is copied from J~, both factors share their noise: its square is subtracted from the value,
     # and the variance counts both together.
-    response = (weight * m) @ e.T - (weight * d) @ o.T
+    response = (weight * m) @ e.T - (weight * smooth_d) @ o.T
     variance = np.zeros_like(response)
-    rendered = f - o
+    rendered, smooth_e = f - o, smooth(e)
     for a in range(len(m)):
-        for terms, sign in ((m[a] * rendered, 1.0), (d[a] * e + m[a] * o, 1.0), (d[a] * rendered, -1.0)):
+        for terms, sign in ((m[a] * rendered, 1.0), (d[a] * smooth_e + m[a] * o, 1.0), (smooth_d[a] * rendered, -1.0)):
             variance[a] += sign * (per_pixel(weight * terms, lights) ** 2).sum(axis=1)
     return FinalSums(
         gradient=gradient,

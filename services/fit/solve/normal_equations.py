@@ -4,6 +4,11 @@ Two independently seeded estimates j1, j2 of a derivative have the mean m = (j1 
 j2. Then m m' - d d' / 4 is the symmetrised product of the two, unbiased for j j', and for any direction u the product
 (u'j1)(u'j2) has the variance E[(u'm)^2 (u'd)^2] (m and d are uncorrelated; exact for Gaussian noise). So one pair of
 estimates gives every sum of this module together with its own variance.
+
+Where derivatives vary smoothly from pixel to pixel, most of their noise does not. With Q the projection of each light's
+rows onto smooth functions of place, orthogonal under the weights, the sums use Qj in place of j: sum w Qj r = sum w j
+Qr, and sum w Qj j' = sum w Qj Qj'. They are unbiased for the smooth part of j, so the gradient vanishes where that
+of j does, whatever Q leaves out; and with K functions for N pixels, a share K / N of the noise of j remains.
 """
 
 from __future__ import annotations
@@ -22,6 +27,11 @@ Array = NDArray[np.float64]
 
 MAX_NOISE_SHARE = 0.9
 """Largest share of a derivative's mean square that is taken for its known noise."""
+
+
+SMALLEST_NORM = 1e-10
+"""Least eigenvalue of the Gram matrix of smooth functions, over the largest, at which a combination of them counts: few
+valid pixels do not tell all functions apart."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +123,28 @@ class NormalEquations:
         return np.sqrt(self.hessian_noise.variance(directions))
 
 
+def smoothed(rows: Array, weight: Array, lights: int, functions: Array | None) -> Array:
+    """The projection Q of rows (F, M), M = lights x pixels, light by light, onto smooth functions of the pixel.
+
+    Args:
+        functions: (K, pixels); None leaves the rows as they are.
+    """
+    if functions is None:
+        return rows
+    found, shape = np.empty_like(rows), (lights, functions.shape[1])
+    for own, w, out in zip(
+        np.moveaxis(rows.reshape(len(rows), *shape), 1, 0),
+        weight.reshape(shape),
+        np.moveaxis(found.reshape(len(rows), *shape), 1, 0),
+        strict=True,
+    ):
+        values, vectors = np.linalg.eigh((functions * w) @ functions.T)
+        used = values > SMALLEST_NORM * max(float(values.max()), 1e-300)
+        basis = (vectors[:, used] / np.sqrt(values[used])).T @ functions
+        out[:] = (own * w) @ basis.T @ basis
+    return found
+
+
 Region = tuple[Sequence[int], NDArray[np.bool_]]
 """Coordinates on which some of the measurements depend, and the mask (M,) of these measurements, for the noise of the
 curvature."""
@@ -129,6 +161,7 @@ def normal_equations(
     regions: Sequence[Region] | None = None,
     exact: int = 0,
     alone: int = 0,
+    functions: Array | None = None,
 ) -> NormalEquations:
     """Normal equations of one block of measurements.
 
@@ -151,25 +184,38 @@ def normal_equations(
         alone: number of exact coordinates, the last of all, that act on one photograph each, such as its shift. The
             noise of their entries with other coordinates is not kept: it takes from the curvature what one of a
             photograph's many pixels adds, and would take the square of their number in memory.
+        functions: smooth functions (K, pixels) of the pixel that the derivatives follow; None for any derivatives.
     """
-    mean, difference = 0.5 * (j1 + j2), j1 - j2
-    residual, spread = 0.5 * (r1 + r2), 0.5 * (r1 - r2)
+    noisy = len(j1) - exact
+    difference, residual, spread = j1 - j2, 0.5 * (r1 + r2), 0.5 * (r1 - r2)
+
+    # The smooth part of noisy derivatives. Sums of it with anything are sums of the whole with the other's smooth part,
+    # whose terms are independent from pixel to pixel: these give the noise.
+    def smooth(rows: Array) -> Array:
+        return np.concatenate([smoothed(rows[:noisy], weight, lights, functions), rows[noisy:]])
+
+    mean, smooth_difference = smooth(0.5 * (j1 + j2)), smooth(difference)
+    smooth_residual = smoothed(residual[None], weight, lights, functions)[0]
 
     # Curvature, and its noise from the products of mean and difference.
     weighted = weight * mean
-    hessian = weighted @ mean.T - 0.25 * (weight * difference) @ difference.T
-    noisy = len(mean) - exact
+    hessian = weighted @ mean.T - 0.25 * (weight * smooth_difference) @ smooth_difference.T
     regions = regions if regions is not None else ((range(noisy), np.ones(len(weight), dtype=bool)),)
     known = range(noisy, len(mean) - alone)
+    beside = np.concatenate([mean[:noisy], smoothed(mean[noisy:], weight, lights, functions)])
     noise = [
-        CurvatureNoise((curvature_noise(mean, difference, np.where(chosen, weight, 0.0), near, lights, known),))
+        CurvatureNoise((curvature_noise(beside, difference, np.where(chosen, weight, 0.0), near, lights, known),))
         for near, chosen in regions
     ]
 
     # The gradient, and its noise summed pixel by pixel.
     by_image, by_jacobian, by_both = (
         per_pixel(terms, lights)
-        for terms in (weighted * spread, 0.5 * weight * difference * residual, 0.5 * weight * difference * spread)
+        for terms in (
+            weighted * spread,
+            0.5 * weight * difference * smooth_residual,
+            0.5 * weight * smooth_difference * spread,
+        )
     )
     sensor, gradient = weight**2 * reference_variance, weighted @ residual
     if exact:
@@ -182,7 +228,7 @@ def normal_equations(
         gradient=gradient,
         hessian_noise=sum(noise[1:], start=noise[0]),
         gradient_noise=by_image @ by_image.T + by_jacobian @ by_jacobian.T - by_both @ by_both.T,
-        data_noise=(sensor * mean) @ mean.T - 0.25 * (sensor * difference) @ difference.T,
+        data_noise=(sensor * mean) @ mean.T - 0.25 * (sensor * smooth_difference) @ smooth_difference.T,
         squares=float(weight @ (residual**2 - spread**2)),
         expected_squares=float(weight @ reference_variance),
     )
