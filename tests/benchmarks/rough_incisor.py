@@ -1,12 +1,15 @@
-"""What fits recover of the micro-CT incisor with a rough surface from stock Mitsuba's images of it, highlights included
+"""What fits recover of the micro-CT incisor with a rough surface from stock Mitsuba's images of it
 (``tests.benchmarks.render_rough_incisor``), and what the unbent surface ``thin`` makes of the same images.
 
 python -m tests.benchmarks.rough_incisor --seeds 1-4 --boundaries rough,thin --json rough_incisor.json
 
-Each seed draws sensor noise and an error of the scan of 0.02 mm, correlated over 1 mm, for enamel and dentin. The fit
-measures the roughness by the highlights, and then holds it. Fits that the folder holds already are not run again.
-``error`` and ``se`` are relative to the truth, ``absorbed`` is 1 - alpha', ``parts`` are those of ``se``; the part
-``photographs`` is what the images' own noise allows.
+Each seed draws sensor noise and an error of the scan of 0.02 mm, correlated over 1 mm, for enamel and dentin. The
+roughness is measured by the highlights of one set of photographs. The media are fitted with this roughness to a second
+set, as through crossed polarisers: the truth's own noise of a fifth of a pixel's value would hide highlights from the
+mask. Fits that the folder holds already are not run again, and a fit that was stopped goes on.
+
+``error`` and ``se`` are relative to the truth, ``absorbed`` is 1 - alpha', ``parts`` are those of ``se``, ``seconds``
+is the processor time of the fit without preparation and roughness.
 """
 
 from __future__ import annotations
@@ -27,7 +30,9 @@ from services.core.geometry import teeth_folder
 from services.core.records import Boundary, JobSpec
 from services.core.results import Estimate, FitReport
 from services.core.stage import LocalContext
-from services.core.store import is_published, open_stage, write_atomic
+from services.core.store import is_published, open_stage, read_record, write_atomic
+from services.fit.measurements.observations import read_observations
+from services.fit.measurements.surface import held_surface
 from services.fit.stage import run
 from services.phantom.files import medium_truth
 from services.preprocess.stage import run as prepare
@@ -81,7 +86,7 @@ def write_capture(target: Path, mean: Images, variance: Images, seed: int) -> No
     (target / "capture.json").write_text(json.dumps(description))
 
 
-def rows_of(job: Path, boundary: Boundary, seed: int) -> list[dict[str, Any]]:
+def rows_of(job: Path, boundary: Boundary, seed: int, roughness: Estimate) -> list[dict[str, Any]]:
     """What the fit of a job found, beside the truth."""
     report = open_stage(job, "fit", FitReport)[1]
     (channel,) = report.parameters
@@ -100,8 +105,8 @@ def rows_of(job: Path, boundary: Boundary, seed: int) -> list[dict[str, Any]]:
         reduced, absorbed = table[f"{part}.sigma_s_reduced"], table[f"{part}.alpha_reduced"]
         add(f"{part} sigma_s_reduced", reduced.value, truth["sigma_s_reduced"], reduced)
         add(f"{part} absorbed", 1 - absorbed.value, 1 - truth["alpha_reduced"], absorbed)
-    if report.surface is not None:
-        add("roughness", report.surface.roughness.value, ROUGHNESS, report.surface.roughness)
+    if boundary == "rough":
+        add("roughness", roughness.value, ROUGHNESS, roughness)
     for name, errors, ses in (
         ("fitted images", report.fit_error, report.fit_error_se),
         ("held-out images", report.held_out_error, report.held_out_error_se),
@@ -112,24 +117,49 @@ def rows_of(job: Path, boundary: Boundary, seed: int) -> list[dict[str, Any]]:
     return found
 
 
+def captures(folder: Path, seed: int) -> tuple[Path, Path]:
+    """The captures of a seed without and with highlights; written where they are not."""
+    polarised, whole = folder / f"polarised-{seed}", folder / f"highlights-{seed}"
+    for capture in (polarised, whole):
+        if not (capture / "capture.json").is_file():
+            found = sums()
+            if found.batches.min() < 2:
+                raise SystemExit(
+                    "The images are not rendered yet; run python -m tests.benchmarks.render_rough_incisor."
+                )
+            inside = np.maximum(found.mean, 0)
+            write_capture(capture, inside + highlights() if capture is whole else inside, found.variance, seed)
+    return polarised, whole
+
+
+def measured_roughness(folder: Path, seed: int) -> Estimate:
+    """The roughness by the highlights of one seed's photographs."""
+    kept, job = folder / f"roughness-{seed}.json", folder / f"roughness-{seed}"
+    if not kept.is_file():
+        spec = JobSpec.model_validate(OPTIONS | {"capture": captures(folder, seed)[1], "boundary": "rough"})
+        if not is_published(job, "prepared"):
+            prepare(spec, LocalContext(job))
+        surface = held_surface(spec, read_observations(job, spec), job, print)
+        assert surface is not None
+        write_atomic(kept, surface.roughness.model_dump_json().encode())
+    return read_record(kept, Estimate)
+
+
 def fitted(folder: Path, boundary: Boundary, seed: int, options: dict[str, Any]) -> list[dict[str, Any]]:
     """Write, prepare and fit one capture, unless the folder holds the result; its rows."""
-    job, capture = folder / f"{boundary}-{seed}", folder / f"capture-{seed}"
+    job = folder / f"{boundary}-{seed}"
     kept = job / "rows.json"
     if kept.is_file():
         rows: list[dict[str, Any]] = json.loads(kept.read_text())
         return rows
-    if not (capture / "capture.json").is_file():
-        found = sums()
-        if found.batches.min() < 2:
-            raise SystemExit("The images are not rendered yet; run python -m tests.benchmarks.render_rough_incisor.")
-        write_capture(capture, np.maximum(found.mean, 0) + highlights(), found.variance, seed)
-    spec = JobSpec.model_validate(OPTIONS | options | {"capture": capture, "boundary": boundary, "seed": seed})
-    context, begun_s = LocalContext(job), time.process_time()
+    roughness, capture = measured_roughness(folder, seed), captures(folder, seed)[0]
+    own = {"capture": capture, "boundary": boundary, "seed": seed, "roughness": roughness.value, "highlights": False}
+    spec, context = JobSpec.model_validate(OPTIONS | options | own), LocalContext(job)
     if not is_published(job, "prepared"):
         prepare(spec, context)
+    begun_s = time.process_time()
     run(spec, context)
-    rows = [row | {"seconds": round(time.process_time() - begun_s)} for row in rows_of(job, boundary, seed)]
+    rows = [row | {"seconds": round(time.process_time() - begun_s)} for row in rows_of(job, boundary, seed, roughness)]
     write_atomic(kept, json.dumps(rows).encode())
     return rows
 

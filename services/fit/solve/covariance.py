@@ -319,7 +319,8 @@ def uncertainty(
     combined = combine_with_prior(
         domain, x, Sandwich(t, inverse, meat, misfit, weighing), parts, np.outer(remaining, remaining), part_count
     )
-    covariance = 0.5 * (combined.covariance + combined.covariance.T)
+    unknown = _left_to_start(domain, whitened.undetermined_directions, combined.covariance)
+    covariance = 0.5 * (combined.covariance + combined.covariance.T) + unknown
     return Uncertainty(
         domain,
         combined.x,
@@ -327,10 +328,26 @@ def uncertainty(
         whitened.undetermined_directions,
         t @ t.T,
         combined.sandwich,
-        combined.parts,
+        {**combined.parts, "prior": combined.parts["prior"] + unknown},
         combined.faults,
         combined.is_full_step,
     )
+
+
+def _left_to_start(domain: Domain, directions: Array, covariance: Array) -> Array:
+    """What a covariance (F, F) lacks along undetermined directions (F, K, scaled) of the error of the fit's start.
+
+    No step is made along such a direction, so its error is that of the start, one scale or what the prior leaves if
+    that is less, however little noise the gradient has there. Curvature that is noise would state less: the more noise
+    the derivatives have, the less.
+    """
+    count, scale = domain.tissue_count, domain.scale
+    own = directions[:count]
+    precision = np.maximum(domain.prior[1][:count] * scale[:count] ** 2, 1.0)
+    alone = np.linalg.inv((own.T * precision) @ own)
+    stated = directions.T @ (covariance / np.outer(scale, scale)) @ directions
+    missing = directions @ positive_part(alone - stated) @ directions.T
+    return np.asarray(missing * np.outer(scale, scale))
 
 
 def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:
