@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.solve.curvature_noise import per_pixel
-from services.fit.solve.normal_equations import smoothed
+from services.fit.solve.normal_equations import smoothed, without_outliers
 
 Array = NDArray[np.float64]
 
@@ -130,8 +130,15 @@ def final_sums(
             renders of the residuals, as in ``normal_equations``.
         functions: smooth functions (K, pixels) that J~ follows, as there.
     """
-    mean, spread = 0.5 * (similar[0] + similar[1]), 0.5 * (similar[0] - similar[1])
-    is_error = np.arange(len(mean)) >= len(mean) - errors
+    is_error = np.arange(len(whiten)) >= len(whiten) - errors
+
+    def clipped(pair: tuple[Array, Array]) -> list[Array]:
+        rows = (without_outliers(one, weight, lights, functions) for one in pair)
+        return [np.where(is_error[:, None], one, own) for one, own in zip(pair, rows, strict=True)]
+
+    first, second = clipped(similar)
+    exact_first, exact_second = clipped(exact)
+    mean, spread = 0.5 * (first + second), 0.5 * (first - second)
 
     # The smooth part Q of the tissue's rows, and of what these are multiplied with where their noise is summed.
     def smooth(rows: Array) -> Array:
@@ -140,7 +147,7 @@ def final_sums(
     def smooth_tissue(rows: Array) -> Array:
         return rows if functions is None else np.where(is_error[:, None], rows, smooth(rows))
 
-    true, true_spread = 0.5 * (exact[0] + exact[1]), 0.5 * (exact[0] - exact[1])
+    true, true_spread = 0.5 * (exact_first + exact_second), 0.5 * (exact_first - exact_second)
     true, true_spread = np.where(copied[:, None], mean, true), np.where(copied[:, None], spread, true_spread)
     own = np.where(copied[:, None], spread, 0.0)
     m, e, f, o = (whiten.T @ rows for rows in (smooth_tissue(mean), true, true_spread, own))

@@ -29,6 +29,12 @@ MAX_NOISE_SHARE = 0.9
 """Largest share of a derivative's mean square that is taken for its known noise."""
 
 
+CLIPPED, CLIPPINGS = 4.0, 3
+"""Robust standard deviations at which a noisy derivative is clipped, and rounds of it. On the micro-CT incisor the
+clipped curvature was 1.2 % less, and its weakest but one direction stood 4.2 and 4.7 times above its noise instead of
+2.8 and 1.6 times."""
+NORMAL_SD = 1.4826
+"""Standard deviation of a normal value over the median of its distance from 0."""
 SMALLEST_NORM = 1e-10
 """Least eigenvalue of the Gram matrix of smooth functions, over the largest, at which a combination of them counts: few
 valid pixels do not tell all functions apart."""
@@ -145,6 +151,27 @@ def smoothed(rows: Array, weight: Array, lights: int, functions: Array | None) -
     return found
 
 
+def without_outliers(rows: Array, weight: Array, lights: int, functions: Array | None) -> Array:
+    """Noisy rows (F, M) whose distance from their smooth part is limited to ``CLIPPED`` robust standard deviations.
+
+    Few paths behind a rough surface bring much of the light, and so a few pixels most of the noise, and most of its
+    estimate. Rows are clipped before they are multiplied with residuals, which stay as they are.
+    """
+    if functions is None:
+        return rows
+    shape = lights, functions.shape[1]
+    seen = weight.reshape(shape) > 0
+    for _ in range(CLIPPINGS):
+        part = smoothed(rows, weight, lights, functions)
+        distance = (rows - part).reshape(len(rows), *shape)
+        limit = np.full((len(rows), lights, 1), np.inf)
+        for light in np.flatnonzero(seen.any(axis=1)):
+            spread = np.median(np.abs(distance[:, light, seen[light]]), axis=1)
+            limit[spread > 0, light, 0] = CLIPPED * NORMAL_SD * spread[spread > 0]
+        rows = part + np.clip(distance, -limit, limit).reshape(rows.shape)
+    return rows
+
+
 Region = tuple[Sequence[int], NDArray[np.bool_]]
 """Coordinates on which some of the measurements depend, and the mask (M,) of these measurements, for the noise of the
 curvature."""
@@ -187,6 +214,9 @@ def normal_equations(
         functions: smooth functions (K, pixels) of the pixel that the derivatives follow; None for any derivatives.
     """
     noisy = len(j1) - exact
+    j1, j2 = (
+        np.concatenate([without_outliers(one[:noisy], weight, lights, functions), one[noisy:]]) for one in (j1, j2)
+    )
     difference, residual, spread = j1 - j2, 0.5 * (r1 + r2), 0.5 * (r1 - r2)
 
     # The smooth part of noisy derivatives. Sums of it with anything are sums of the whole with the other's smooth part,
