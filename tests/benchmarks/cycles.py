@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from services.assets.mitsuba.dielectric import ROUGHNESS
 from services.core.files.meshes import read_mesh
 from services.core.store import write_atomic
 from services.transport.optics.parameters import Medium, Tissue
@@ -66,7 +67,9 @@ def cases() -> dict[str, tuple[Callable[[], Case], int, int, float]]:
         "nested balls, thin, sky": (lambda: replace(nested, boundary="thin"), 1024, 1024, 0.005),
         "nested balls, thin, lamp": (lambda: replace(nested, boundary="thin", lit_by="lamp"), 8192, 8192, 0.01),
         "glass ball, sky": (
-            lambda: replace(simple, boundary="thin", glass=DIELECTRIC, words=("--surface", "glass")),
+            lambda: replace(
+                simple, boundary="thin", glass=DIELECTRIC, words=("--surface", "glass", "--roughness", "0")
+            ),
             2048,
             2048,
             0.01,
@@ -75,8 +78,8 @@ def cases() -> dict[str, tuple[Callable[[], Case], int, int, float]]:
             lambda: replace(
                 simple,
                 boundary="thin",
-                glass=DIELECTRIC | {"type": "roughdielectric", "distribution": "ggx", "alpha": 0.09},
-                words=("--surface", "glass", "--roughness", "0.3"),
+                glass=DIELECTRIC | {"type": "roughdielectric", "alpha": ROUGHNESS},
+                words=("--surface", "glass"),
             ),
             2048,
             2048,

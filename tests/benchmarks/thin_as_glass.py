@@ -1,12 +1,13 @@
 """What it costs to show a tooth that was fitted with the boundary ``thin`` by a dielectric, as renderers have one.
 
-python -m tests.benchmarks.thin_as_glass --json glass.json [--paths 256] [--seeds 2]
+python -m tests.benchmarks.thin_as_glass --json glass.json [--paths 256] [--seeds 2] [--surfaces NAME ...]
 
 Stock Mitsuba (``prbvolpath``) renders a virtual incisor with the shipped ``thin_boundary.py``, with ``dielectric`` and
 with ``roughdielectric`` of alpha 0.12, of the same index and media, in two views under an even sky, a large lamp in
 front and one behind. A row holds the picture ÷ that of the thin boundary (mean over the tooth, by channel), its
 standard error from the seeds, and the median and 95th percentile of ΔE00 over squares of 4 mm. White is the
-brightest square of the thin boundary's picture. ``absorption`` is the factor on the media's absorption.
+brightest square of the thin boundary's picture. ``absorption`` is the factor on the media's absorption. The surface
+``blender`` is what the script for Blender shows with ``--surface glass`` under the sky; it needs ``make clients``.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.templates.incisor import build_incisor
+from services.assets.mitsuba.dielectric import ABSORPTION
 from services.assets.mitsuba.scene import medium_dict, sensor_dict
 from services.assets.mitsuba.shipped.thin_boundary import register
 from services.core.files.meshes import write_mesh
 from services.core.store import write_atomic
-from services.transport.optics.parameters import Medium
+from services.transport.optics.parameters import Medium, Tissue
 from services.transport.platform import prepare_device
+from tests.support.cycles_scenes import Case, cycles_image, write_case
 from tests.support.small_tooth import camera_at
 
 IOR, ROUGHNESS = 1.631, 0.12
@@ -41,6 +44,7 @@ SURFACES = {
     "dielectric": {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0},
     "roughdielectric": {"type": "roughdielectric", "int_ior": IOR, "ext_ior": 1.0, "alpha": ROUGHNESS},
 }
+BLENDER = "blender"
 VIEWS = ((0.2, 1.0, 0.15), (-0.9, 0.7, -0.2))
 LIGHTS = {"sky": None, "lamp before it": (700.0, 700.0, 300.0), "lamp behind it": (-250.0, -850.0, 200.0)}
 LAMP_MM = 400.0
@@ -82,6 +86,22 @@ def image_of(folder: Path, view: int, light: str, surface: str, factor: float, p
     return np.stack(planes, axis=-1)
 
 
+def blender_image(folder: Path, view: int, paths: int, seed: int) -> Array:
+    """Radiance (H, W, 3) under the sky by the script for Blender, whose conversion has its own factor."""
+    incisor = build_incisor(24)
+    case = Case(
+        incisor.outer,
+        incisor.dentin,
+        tuple(Tissue(*media) for media in MEDIA.values()),
+        camera_at(VIEWS[view], size=SIZE, span_mm=16.0),
+        boundary="thin",
+        words=("--surface", "glass"),
+    )
+    if not (folder / "rig.json").is_file():
+        write_case(folder, case)
+    return cycles_image(folder, case, paths, seed)
+
+
 def _absorbing(medium: Medium, factor: float) -> Medium:
     """The medium with so many times its absorption, and its scattering as it is."""
     scattering, absorption = medium.sigma * medium.alpha, medium.sigma * (1 - medium.alpha) * factor
@@ -112,6 +132,7 @@ def main() -> None:
     parser.add_argument("--paths", type=int, default=256)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--absorption", type=float, nargs="+", default=[1.0])
+    parser.add_argument("--surfaces", nargs="+", default=["dielectric", "roughdielectric"])
     options = parser.parse_args()
     prepare_device()
     register()
@@ -121,13 +142,22 @@ def main() -> None:
         write_mesh(folder / "outer.ply", incisor.outer)
         write_mesh(folder / "dentin.ply", incisor.dentin)
         for view in range(len(VIEWS)):
-            for light in LIGHTS:
+            for light in LIGHTS if set(options.surfaces) != {BLENDER} else ["sky"]:
                 seeds = range(options.seeds)
                 thin = np.stack([image_of(folder, view, light, "thin", 1.0, options.paths, k) for k in seeds])
                 covered = _covered(folder, view)
-                for surface in ("dielectric", "roughdielectric"):
-                    for factor in options.absorption:
-                        found = [image_of(folder, view, light, surface, factor, options.paths, 99 + k) for k in seeds]
+                for surface in options.surfaces:
+                    for factor in [ABSORPTION] if surface == BLENDER else options.absorption:
+                        if surface != BLENDER:
+                            found = [
+                                image_of(folder, view, light, surface, factor, options.paths, 99 + k) for k in seeds
+                            ]
+                        elif LIGHTS[light] is None:
+                            found = [
+                                blender_image(folder / f"blender-{view}", view, options.paths, 99 + k) for k in seeds
+                            ]
+                        else:
+                            continue
                         ratios = np.array([a[covered].mean(axis=0) / b[covered].mean(axis=0)
                                            for a, b in zip(found, thin, strict=True)])  # fmt: skip
                         delta = differences(np.mean(found, axis=0), thin.mean(axis=0), covered)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.assets.mitsuba.dielectric import ABSORPTION
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.scene.stain_uv import ToothStains, stain_layout
 from tests.support.clients import client_python, run_client
@@ -153,13 +154,21 @@ def test_stains_darken_where_their_picture_says(tmp_path: Path) -> None:
     assert save(tmp_path)["images"] == [["stain_green.png", True]]
 
 
-def test_glass_and_subsurface_are_told(asset: Path, tmp_path: Path) -> None:
+def test_glass_and_subsurface_are_told(asset: Path, saved: Facts, tmp_path: Path) -> None:
     shutil.copytree(asset, tmp_path / "asset")
     rig = json.loads((tmp_path / "asset/rig.json").read_text())
     (tmp_path / "asset/rig.json").write_text(json.dumps(rig | {"boundary": "thin"}))
     glass = save(tmp_path / "asset", "--surface", "glass")
     assert "ShaderNodeBsdfGlass" in glass["scenes"]["teeth"]["meshes"]["tooth_11_enamel"]["material"]["kinds"]
-    assert "refracts" in "".join(glass["texts"].values())
+    # The media of glass are those of the asset's scene_dielectric.xml, and the object keeps the numbers of the fit.
+    enamel, usual = (each["scenes"]["teeth"]["meshes"]["tooth_11_enamel"] for each in (glass, saved))
+    np.testing.assert_allclose(enamel["sigma_per_mm"], usual["sigma_per_mm"], rtol=1e-12)
+    for converted, fitted in zip(enamel["material"]["volumes"], usual["material"]["volumes"], strict=True):
+        np.testing.assert_allclose(converted["absorption"], ABSORPTION * np.array(fitted["absorption"]), rtol=1e-6)
+        np.testing.assert_allclose(converted["scattering"], fitted["scattering"], rtol=1e-6)
+    told = "".join(glass["texts"].values())
+    assert "refracts" in told
+    assert f"{ABSORPTION} times the absorption" in told
     simple = save(tmp_path / "asset", "--subsurface")
     assert list(simple["scenes"]["teeth"]["meshes"]) == ["tooth_11"]
     assert "Front light, distant shots" in "".join(simple["texts"].values())

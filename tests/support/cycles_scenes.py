@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from services.assets.asset import write_asset
 from services.assets.blender.scripts import write_scripts
+from services.assets.mitsuba.dielectric import as_dielectric
 from services.assets.mitsuba.scene import load_scene, nested_scene
 from services.core.geometry import Camera, Light, Mesh, Tooth
 from services.core.records import Boundary
@@ -39,7 +40,8 @@ class Case:
     roughness: float = 0.15
     """Of boundary ``rough``, without light that meets several facets, which stock Mitsuba loses."""
     glass: dict[str, Any] | None = None
-    """Mitsuba's surface that replaces the asset's, where the script is asked for glass."""
+    """Mitsuba's surface that replaces the thin boundary of the asset's dielectric scene, where the script is asked for
+    glass; under the sky only."""
     words: tuple[str, ...] = field(default=())
     """Further options of the script."""
     lamp: Light = LAMP
@@ -159,6 +161,7 @@ def mitsuba_image(folder: Path, case: Case, samples: int, seed: int, *, fits: bo
             if case.lit_by == "sky":
                 scene["light"] = {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}
             if case.glass is not None:
+                scene = as_dielectric(scene)
                 scene["outer_11"]["bsdf"] = case.glass
             if fits:
                 media = {"enamel": tissue.enamel} | ({} if case.dentin is None else {"dentin": tissue.dentin})

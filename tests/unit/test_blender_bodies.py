@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 
 from services.assets.blender.scripts import SHIPPED, write_scripts
+from services.assets.mitsuba.dielectric import ABSORPTION, ROUGHNESS, as_dielectric
 from services.assets.mitsuba.mouth_scene import write_mouth_surfaces
+from services.assets.mitsuba.scene import medium_dict
 from services.core.files.meshes import read_mesh, write_mapped_mesh, write_mesh
 from services.core.geometry import Mesh, Tooth
+from services.transport.optics.parameters import Medium
 from tests.support.small_mouth import CORE, FREE, GUMS_IOR, IOR, ROOTED, gums, wall
 from tests.support.small_tooth import ellipsoid, sphere
 
@@ -88,6 +91,25 @@ def test_numbers_are_the_assets(tmp_path: Path) -> None:
     np.testing.assert_array_equal(asset.intensity("l0"), [1.0, 2.0, 2.0])
     assert asset.one_phase
     assert READER.Asset(tmp_path, ["green"]).channels == ["green"] * 3
+
+
+def test_glass_of_a_thin_boundary_is_that_of_the_dielectric_scene(tmp_path: Path) -> None:
+    write_tooth(tmp_path, "thin")
+    asset = READER.Asset(tmp_path)
+    assert (READER.THIN_ABSORPTION, READER.THIN_ALPHA) == (ABSORPTION, ROUGHNESS)
+    # Mitsuba's facets are Beckmann's unless told otherwise; Cycles' roughness is the root of their width.
+    assert asset.finish("glass", None) == ("glass", pytest.approx(ROUGHNESS**0.5), "BECKMANN")
+    assert asset.finish("glass", 0.0) == ("glass", 0.0, "BECKMANN")
+    assert asset.finish("asset", None) == ("asset", 0.0, "GGX")
+    assert (asset.as_glass("glass"), asset.as_glass("asset")) == (True, False)
+    fitted = asset.medium("enamel")
+    converted, own = fitted.absorbing(ABSORPTION), medium_dict(Medium(2.0, 0.9, 0.8, 0.6, -0.5))
+    scene = as_dielectric({"medium_enamel": own})["medium_enamel"]
+    assert converted.sigma[0] == pytest.approx(scene["sigma_t"])
+    assert converted.alpha[0] == pytest.approx(scene["albedo"])
+    empty = READER.Medium(*np.zeros((5, 3))).absorbing(ABSORPTION)
+    assert not empty.sigma.any()
+    assert not empty.alpha.any()
 
 
 def test_other_cosines_in_a_channel_are_seen(tmp_path: Path) -> None:

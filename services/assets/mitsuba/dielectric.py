@@ -7,7 +7,8 @@ from typing import Any
 from services.assets.mitsuba.scene import SceneDict
 
 ROUGHNESS = 0.12
-"""GGX width of a wet tooth; a smooth dielectric gave the same pictures within their noise."""
+"""Beckmann width of a wet tooth, Mitsuba's usual facets. Those of GGX lose 8 % of an incisor's light; a smooth
+dielectric gave the same pictures within their noise."""
 ABSORPTION = 0.3
 """Factor on the absorption. From inside, a dielectric of index 1.631 sends back 0.67 of diffuse light and the thin
 boundary 0.11, so light stays longer inside, and the absorption that was fitted with the thin boundary is too large."""

@@ -24,7 +24,9 @@ class Look:
     roughness: float = 0.0
     """Roughness as Cycles has it: its square is GGX's alpha."""
     distribution: str = "GGX"
-    """Of a surface of glass; MULTI_GGX gives back the light that meets several facets."""
+    """Of the facets of glass; MULTI_GGX gives back the light that meets several facets."""
+    absorption: float = 1.0
+    """Factor on the absorption of all media."""
     highlight: float | None = None
     smooth: bool = True
     subsurface: bool = False
@@ -158,7 +160,10 @@ def fill(material: Any, body: Any, look: Look, unit: float) -> None:
     if look.subsurface:
         shaders = {"Surface": subsurface(nodes, body.medium, unit)}
     else:
-        shaders = {"Volume": volume(nodes, body.medium, unit), "Surface": boundary(nodes, body, look)}
+        shaders = {
+            "Volume": volume(nodes, body.medium.absorbing(look.absorption), unit),
+            "Surface": boundary(nodes, body, look),
+        }
     for name, shader in shaders.items():
         if shader is not None:
             nodes.tree.links.new(shader.outputs[0], output.inputs[name])
