@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,8 @@ class AssetPart:
     """Channel -> ``sigma``, ``alpha``, ``sigma_s_reduced`` ... -> estimate."""
     stains: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Channel -> transmittance (H, W) in the mesh's chart, where stains were fitted."""
+    stain_errors: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Channel -> its standard error (H, W), where the fit kept one."""
 
     def told_estimates(self) -> dict[str, dict[str, Any]]:
         """The estimates as JSON values: channel -> name -> value, se, unit, determined."""
@@ -148,13 +150,13 @@ def read_content(job: Path) -> AssetContent:
             }
             for channel, table in tables.items()
         }
-        stains = {} if place is None else _stains(place, tuple(tables))
+        stains, errors = ({}, {}) if place is None else (_stains(place, tables), _stains(place, tables, "_se"))
         charted = None if place is None else read_texture_coordinates(place / "outer.ply")
         if charted is None:
             mesh = people_mesh(surface, None if place is None else TEXEL_MM)
         else:
             mesh = mapped_people_mesh(surface, charted, _size(surface, charted, stains))
-        parts.append(AssetPart(name, tissue, fdi, surface, mesh, own, stains))
+        parts.append(AssetPart(name, tissue, fdi, surface, mesh, own, stains, errors))
 
     if is_object:
         ((body, core),) = [(one.outer, one.dentin) for one in read_teeth(folder, (OBJECT,))]
@@ -187,8 +189,8 @@ def read_tables(folder: Path) -> Tables:
         raise CorruptStoreError(f"{path} cannot be read; write it again with dentine export.") from problem
 
 
-def _stains(place: Path, channels: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
-    files = {channel: place / f"stain_{channel}.npy" for channel in channels}
+def _stains(place: Path, channels: Iterable[str], kind: str = "") -> dict[str, NDArray[np.float64]]:
+    files = {channel: place / f"stain_{channel}{kind}.npy" for channel in channels}
     return {channel: np.load(file).astype(np.float64) for channel, file in files.items() if file.is_file()}
 
 

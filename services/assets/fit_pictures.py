@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from services.assets.report_page import ReportPictures
-from services.assets.stains import stain_image
+from services.assets.stains import stain_images
 from services.core.geometry import Camera, Tooth
 from services.core.pages.pictures import PICTURES, read_pictures
 from services.transport.scene.stain_uv import ToothStains
@@ -26,7 +26,6 @@ def report_pictures(
     pictures = read_pictures(folder / PICTURES)
     if tooth is None:
         return ReportPictures(channels, pictures)
-    stain_map = None if stains is None else stain_image(tooth.outer, stains, cameras[0])
-    return ReportPictures(
-        channels, pictures, thickness, cameras[0].name, stain_map, () if stains is None else tuple(stains.textures)
-    )
+    stain_map, errors = (None, None) if stains is None else stain_images(tooth.outer, stains, cameras[0])
+    stained = () if stains is None else tuple(stains.textures)
+    return ReportPictures(channels, pictures, thickness, cameras[0].name, stain_map, errors, stained)

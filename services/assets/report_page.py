@@ -4,7 +4,6 @@ fit fails.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from services.assets.curves import Series, log_chart
 from services.assets.instrument_tables import instrument_tables, source_tables
+from services.assets.surface_maps import stain_maps, thickness_maps
 from services.core.pages.cells import cell, gradient
 from services.core.pages.page import page_template
 from services.core.pages.pictures import (
@@ -24,7 +24,6 @@ from services.core.pages.pictures import (
     Picture,
     data_uri,
     enlarge,
-    scalar_map,
     signed_map,
     tone_map,
     white_level,
@@ -79,7 +78,9 @@ class ReportPictures:
     camera: str = ""
     """Name of the camera of the thickness map and of the stains."""
     stains: NDArray[np.floating] | None = None
-    """Transmittance of the stains (H, W, C), NaN off the tooth; see ``stains.stain_image``."""
+    """Transmittance of the stains (H, W, C), NaN off the tooth; see ``stains.stain_images``."""
+    stain_errors: NDArray[np.floating] | None = None
+    """Standard error of that (H, W, C), NaN also in channels where it is not known; None where it is known in none."""
     stained: tuple[str, ...] = ()
     """The C channels that have stains."""
 
@@ -143,9 +144,11 @@ def write_report(
             (fdi, [sentence for sentence in (tooth.sentence, tooth.told) if sentence])
             for fdi, tooth in report.teeth.items()
         ],
-        thickness=_thickness(pictures),
+        thickness=thickness_maps(
+            pictures.thickness, "" if pictures.thickness is None else _spread(pictures.thickness.mean), pictures.camera
+        ),
         thickness_bar=gradient(SEQUENTIAL),
-        stains=_stains(pictures),
+        stains=stain_maps(pictures.stains, pictures.stain_errors, pictures.stained, pictures.camera),
         caveat=THIN_CAVEAT if boundary == "thin" else "",
         provenance=_provenance(boundary, context),
         appearance=context.get("appearance"),
@@ -351,42 +354,6 @@ def _label(name: str) -> str:
     if part == "shape" and leaf.isdigit() and int(leaf) < len(SHAPE_LABELS):
         return f"weight c, {SHAPE_LABELS[int(leaf)]}"
     return LEAF_LABELS.get(leaf, name)
-
-
-def _thickness(pictures: ReportPictures) -> dict[str, Any] | None:
-    found = pictures.thickness
-    if found is None:
-        return None
-    high = max(0.5, math.ceil(2 * float(np.nanpercentile(found.image_mm, 99))) / 2)
-    maps = [("Distance from the outer surface to dentin", found.image_mm, high, _spread(found.mean))]
-    if found.errors_mm is not None:
-        most = max(0.05, math.ceil(20 * float(np.nanpercentile(found.errors_mm, 99))) / 20)
-        maps.append(("Its standard error", found.errors_mm, most, f"{np.nanmean(found.errors_mm):.2f} mm"))
-    drawn = [
-        (what, data_uri(enlarge(scalar_map(values, (0.0, most)), 240)), f"{most:g} mm", mean)
-        for what, values, most, mean in maps
-    ]
-    height, width = found.image_mm.shape
-    return {"maps": drawn, "camera": pictures.camera, "width": str(width), "height": str(height)}
-
-
-def _stains(pictures: ReportPictures) -> dict[str, Any] | None:
-    # One map per channel, from the darkest visible texel to a clean surface; with few channels separate maps are
-    # clearer than one in colour.
-    if pictures.stains is None or not np.isfinite(pictures.stains).any():
-        return None
-    low = float(np.floor(10 * np.nanmin(pictures.stains)) / 10)
-    drawn = [(name, scalar_map(pictures.stains[..., k], (low, 1.0))) for k, name in enumerate(pictures.stained)]
-    return {
-        "images": [
-            (name, data_uri(enlarge(image, 240)), f"{np.nanmean(pictures.stains[..., k]):.2f}")
-            for k, (name, image) in enumerate(drawn)
-        ],
-        "camera": pictures.camera,
-        "low": f"{low:g}",
-        "width": str(pictures.stains.shape[1]),
-        "height": str(pictures.stains.shape[0]),
-    }
 
 
 def _provenance(boundary: str, context: dict[str, Any]) -> Sequence[tuple[str, str]]:

@@ -14,41 +14,40 @@ from services.transport.scene.stain_uv import ToothStains, bilinear_texels
 
 
 def write_textures(folder: Path, stains: ToothStains) -> dict[str, Path]:
-    """Write ``stain_<channel>.npy``, the fitted a_t, and ``stain_<channel>.png``, the absorbed share 1 - a_t in 16
-    bits; return the pictures' paths by channel.
+    """Write ``stain_<channel>.npy``, the fitted a_t, ``stain_<channel>_se.npy``, its standard error where that is
+    known, and ``stain_<channel>.png``, the absorbed share 1 - a_t in 16 bits; return the pictures' paths by channel.
     """
     written = {}
     for channel, stain in stains.textures.items():
         np.save(folder / f"stain_{channel}.npy", stain.transmittance.astype(np.float32))
+        if stain.se is not None:
+            np.save(folder / f"stain_{channel}_se.npy", stain.se.astype(np.float32))
         written[channel] = folder / f"stain_{channel}.png"
         write_atomic(written[channel], png16_bytes(1 - stain.transmittance))
     return written
 
 
-def stain_image(outer: Mesh, stains: ToothStains, camera: Camera) -> NDArray[np.float64]:
-    """Transmittance a_t at the surface point that each pixel shows, (H, W, C) in the textures' order; NaN off the
-    tooth.
+def stain_images(
+    outer: Mesh, stains: ToothStains, camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Transmittance a_t at the surface point that each pixel shows, (H, W, C) in the textures' order, and its standard
+    error: NaN off the tooth and, for the error, in channels where it is not known; None where it is known in none.
+
+    Between texels the error is interpolated too, which is its upper limit: the errors of neighbours then agree.
     """
     from services.transport.rays import RayScene, pixel_rays
+    from services.transport.stain_view import surface_uv
 
     hits = RayScene(outer).first_hits(*pixel_rays(camera))
     width, height = camera.size
-    image = np.full((height * width, len(stains.textures)), np.nan)
-    corners = outer.vertices_mm[outer.faces[hits.face[hits.hit]]]
-
-    # Barycentric weights from the areas of the three triangles that a point forms with the edges.
-    def doubled_area(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
-
-    points = hits.points_mm[hits.hit]
-    weights = np.stack(
-        [doubled_area(points, corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]) for k in range(3)], axis=1
-    )
-    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
-    uv = np.einsum("nc,ncd->nd", weights, stains.corners_uv[hits.face[hits.hit]])
+    image, errors = (np.full((height * width, len(stains.textures)), np.nan) for _ in range(2))
+    uv = surface_uv(outer, stains.corners_uv, hits)
     for k, stain in enumerate(stains.textures.values()):
         image[hits.hit, k] = looked_up(stain.transmittance, uv)
-    return image.reshape(height, width, -1)
+        if stain.se is not None:
+            errors[hits.hit, k] = looked_up(stain.se, uv)
+    known = any(stain.se is not None for stain in stains.textures.values())
+    return image.reshape(height, width, -1), errors.reshape(height, width, -1) if known else None
 
 
 def looked_up(picture: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -77,6 +77,10 @@ def test_the_texture_explains_what_media_cannot(stained: tuple[Path, FitReport, 
     truth, layout = stained_truth(root)
     assert found is not None
     assert truth.stain is not None
+    errors = found.textures["green"].se
+    assert errors is not None
+    assert (errors[layout.index >= 0] > 0).all()
+    assert not errors[layout.index < 0].any()
     engine = FakeEngine(replace(RECIPE, teeth=(ToothSurfaces(sphere(4.0), None, layout.corners_uv),)))
     view = View(camera("c0"), np.argwhere(np.ones(SIZE)).astype(np.int32))
     texels, shares = engine._texels(view, truth.stain)
@@ -123,7 +127,11 @@ def test_asset_and_report_carry_the_texture(stained: tuple[Path, FitReport, list
     assert "teeth/11/stain_green.png" in (root / "asset/scene_green.xml").read_text()
     # Reading the surface merges the vertices that the texture's seams split.
     assert len(read_mesh(root / "asset/teeth/11/outer.ply").vertices_mm) == len(sphere(4.0).vertices_mm)
+    errors = kept.textures["green"].se
+    assert errors is not None
+    np.testing.assert_allclose(np.load(root / "asset/teeth/11/stain_green_se.npy"), errors, rtol=1e-6)
     page = (root / "report.html").read_text()
+    assert "Channel green: its standard error, with the media as they were fitted" in page
     assert "<h2>Stains</h2>" in page
     assert "Channel green" in page
 

@@ -118,6 +118,7 @@ def test_stains_lie_in_the_chart_of_the_fit_and_darken_the_colour(tmp_path: Path
     def stained(writer: StageWriter) -> None:
         write_mapped_mesh(writer.folder / "teeth/11/outer.ply", outer, layout.corners_uv)
         np.save(writer.folder / "teeth/11/stain_green.npy", stain.astype(np.float32))
+        np.save(writer.folder / "teeth/11/stain_green_se.npy", (0.1 * stain).astype(np.float32))
 
     root = published(tmp_path, before=stained, rig={"views": {}})
     export_to(root, ("gltf", "usd", "blender"))
@@ -129,6 +130,11 @@ def test_stains_lie_in_the_chart_of_the_fit_and_darken_the_colour(tmp_path: Path
     values = plane(folder / said["stain"]["exr"], "green")
     place, weight = bilinear_texels(texels.uv, (stain.shape[0], stain.shape[1]))
     np.testing.assert_allclose(values, texels.picture((stain.reshape(-1)[place] * weight).sum(axis=1)), rtol=1e-6)
+    # Standard errors are interpolated as the transmittances are.
+    np.testing.assert_allclose(plane(folder / said["stain_se"]["exr"], "green"), 0.1 * values, rtol=1e-5)
+    counts = np.array(Image.open(folder / said["stain_se"]["png"]["green"])) / 65535
+    np.testing.assert_allclose(counts, 0.1 * values, atol=0.51 / 65535)
+    assert "with the media as they were fitted" in said["stain_se"]["meaning"]
     height = texels.picture(texels.points_mm[:, 2])
     # Half a texel of 1 mm around the border is of both kinds.
     np.testing.assert_allclose(values[height > 1.5], np.exp(-0.7), rtol=1e-6)
@@ -143,6 +149,20 @@ def test_stains_lie_in_the_chart_of_the_fit_and_darken_the_colour(tmp_path: Path
         assert same == said
         for file in sorted(path.name for path in folder.iterdir()):
             assert (other / file).read_bytes() == (folder / file).read_bytes()
+
+
+def test_stains_of_an_earlier_fit_have_no_standard_error(tmp_path: Path) -> None:
+    outer = sphere(4.0)
+    layout = stain_layout(outer, 2.0)
+
+    def stained(writer: StageWriter) -> None:
+        write_mapped_mesh(writer.folder / "teeth/11/outer.ply", outer, layout.corners_uv)
+        np.save(writer.folder / "teeth/11/stain_green.npy", np.full(layout.index.shape, 0.5, dtype=np.float32))
+
+    root = published(tmp_path, before=stained)
+    export_to(root, ("gltf",))
+    _, said = told(root)
+    assert said["stain_se"] == {"absent": "The fit was made before stains had a standard error; make it again."}
 
 
 def test_thickness_has_the_standard_error_of_the_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,12 @@ BASE_COLOUR = (
     "linear reflectance under even light of enamel of this thickness on deep dentin, less what stains absorb; the PNG"
     " has the curve of sRGB"
 )
+STAIN = "transmittance of the stain, 1 where it absorbs nothing; light passes it on its way in and out"
+STAIN_ERROR = (
+    "standard error of the transmittance, with the media as they were fitted: an error that is the same everywhere is"
+    " nearly one of the media's absorption and is not included"
+)
+NO_STAIN_ERROR = "The fit was made before stains had a standard error; make it again."
 FIRST_ROW = "v = 0 in PLY files and glTF, v = 1 in USD and Blender"
 
 Picture = NDArray[np.float64]
@@ -68,16 +74,20 @@ def _write(folder: Path, name: str, textures: ToothTextures) -> dict[str, Any]:
         }
     if textures.thickness_mm is not None and textures.thickness_se_mm is None:
         told["thickness_se"] = {"absent": textures.why_no_se}
-    if textures.stains:
-        for channel, values in textures.stains.items():
-            write_atomic(folder / f"{name}_stain_{channel}.png", png16_bytes(values))
-        named = set(RGB) == set(textures.stains)
-        planes = {(c[0].upper() if named else c): values for c, values in textures.stains.items()}
-        _write_exr(folder / f"{name}_stain.exr", planes)
-        told["stain"] = {
-            "png": {channel: f"{name}_stain_{channel}.png" for channel in textures.stains},
-            "exr": f"{name}_stain.exr",
-            "meaning": "transmittance of the stain, 1 where it absorbs nothing; light passes it on its way in and out",
+    kinds = (("stain", textures.stains, STAIN), ("stain_se", textures.stain_errors, STAIN_ERROR))
+    for key, pictures, meaning in kinds if textures.stains else ():
+        if not pictures:
+            told[key] = {"absent": NO_STAIN_ERROR}
+            continue
+        for channel, values in pictures.items():
+            write_atomic(folder / f"{name}_{key}_{channel}.png", png16_bytes(values))
+        named = set(RGB) == set(pictures)
+        planes = {(c[0].upper() if named else c): values for c, values in pictures.items()}
+        _write_exr(folder / f"{name}_{key}.exr", planes)
+        told[key] = {
+            "png": {channel: f"{name}_{key}_{channel}.png" for channel in pictures},
+            "exr": f"{name}_{key}.exr",
+            "meaning": meaning,
         }
     return told
 

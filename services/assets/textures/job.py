@@ -30,5 +30,5 @@ def bake_textures(job: Path, spec: JobSpec | None, content: AssetContent) -> dic
         media = part.media()
         if media and (fdi in dentins or part.stains):
             core = dentins[fdi].media() if fdi in dentins else {}
-            sets[part.name] = bake(part.mesh, media, core, thickness.get(fdi), part.stains)
+            sets[part.name] = bake(part.mesh, media, core, thickness.get(fdi), part.stains, part.stain_errors)
     return sets

@@ -38,6 +38,8 @@ class ToothTextures:
     """Why there is no standard error, in a sentence; empty where there is one."""
     stains: Mapping[str, Array]
     """Channel -> transmittance of the stain, 1 where nothing is absorbed."""
+    stain_errors: Mapping[str, Array]
+    """Channel -> its standard error, where the fit kept one."""
 
 
 def bake(
@@ -46,6 +48,7 @@ def bake(
     dentin: Mapping[str, Medium],
     thickness: Thickness | None,
     stains: Mapping[str, Array],
+    stain_errors: Mapping[str, Array],
 ) -> ToothTextures:
     """The textures of one tooth.
 
@@ -55,10 +58,13 @@ def bake(
         dentin: the same; empty without dentin.
         thickness: what tells the enamel's thickness; None without dentin.
         stains: transmittances in the same chart, of any size.
+        stain_errors: their standard errors, of the same size; empty where there are none.
     """
     texels = texels_of(mesh)
     found = None if thickness is None else thickness.at(texels.points_mm)
-    passed = {channel: looked_up(stain, texels.uv) for channel, stain in stains.items()}
+    passed, errors = (
+        {channel: looked_up(picture, texels.uv) for channel, picture in one.items()} for one in (stains, stain_errors)
+    )
     colours = {}
     for channel, medium in enamel.items():
         if found is None or channel not in dentin:
@@ -77,4 +83,5 @@ def bake(
         thickness_se_mm=None if found is None or found[1] is None else texels.picture(found[1]),
         why_no_se="" if thickness is None else thickness.why_no_se,
         stains={channel: texels.picture(values) for channel, values in passed.items()},
+        stain_errors={channel: texels.picture(values) for channel, values in errors.items()},
     )

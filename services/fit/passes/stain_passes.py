@@ -14,9 +14,10 @@ alternate to the end.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from services.tasks.journal import Journal
 from services.transport.optics.parameters import Tissue
 from services.transport.scene.recipe import StackEstimate, StainGradient
 from services.transport.scene.stain_uv import StainLayout
+from services.transport.stain_view import seen_texels
 
 RATIO_STEPS, PATTERN_STEPS = 2, 3
 """Numbers of ratio and pattern steps before the media's first refit."""
@@ -43,12 +45,25 @@ SIGNIFICANCE_Z = 3.0
 """Standard errors by which the gain of a texture has to exceed that of fitted noise."""
 
 
-def stain_task(
-    host: EngineHost, task: BlockTask, similar: Tissue, seeds: tuple[int, int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float, TraceRow]:
-    """Derivatives of one block's sum(w ref C) and sum(w C1 C) with respect to the texels (H, W), from shared paths, and
-    the block's sum of weighted squared residuals without their Monte Carlo variance.
-    """
+@dataclass(frozen=True)
+class StainPart:
+    """What one block of N pixels adds to the sums, and its trace."""
+
+    explained: NDArray[np.float64]
+    """Derivative of sum(w ref C) with respect to the texels (H, W)."""
+    carried: NDArray[np.float64]
+    """Derivative of sum(w C1 C), from the same paths."""
+    squares: float
+    """Sum of weighted squared residuals without their Monte Carlo variance."""
+    count: int
+    """Number of measurements."""
+    light: NDArray[np.float64]
+    """sum w C1^2 of each pixel (N,) over the lights, without its Monte Carlo variance."""
+    trace: TraceRow
+
+
+def stain_task(host: EngineHost, task: BlockTask, similar: Tissue, seeds: tuple[int, int]) -> StainPart:
+    """Render a block and the derivatives with respect to the texels."""
     start, block = time.time(), block_of(task)
     view, weight = block.fitted_view, block.fit_weight
     image: StackEstimate = host.call("images", task.recipe, task.tissue, view, samples=task.samples, seed=seeds[0])
@@ -62,8 +77,14 @@ def stain_task(
         return texels
 
     rendered = photographed(image.mean, block, dict(task.errors))
-    squares = float((weight * ((rendered - block.reference) ** 2 - image.variance)).sum())
-    return gradient(weight * block.reference), gradient(weight * rendered), squares, trace_row("stain", task, start)
+    return StainPart(
+        gradient(weight * block.reference),
+        gradient(weight * rendered),
+        float((weight * ((rendered - block.reference) ** 2 - image.variance)).sum()),
+        int((weight > 0).sum()),
+        np.maximum((weight * (rendered**2 - image.variance)).sum(axis=0), 0.0),
+        trace_row("stain", task, start),
+    )
 
 
 @dataclass
@@ -89,7 +110,8 @@ class StainStage:
                 is the last.
 
         Returns:
-            The tissue with its stain, or None where a clean surface explains the images equally well.
+            The tissue with its stain and the stain's standard errors, or None where a clean surface explains the images
+            equally well.
         """
         solver = StainSolver(self.layout.neighbours, len(self.layout.points_mm))
         state, stained = clean_state(solver.texels), tissue
@@ -105,12 +127,11 @@ class StainStage:
                 )
                 stained, done = self._with_stain(stained, state), done + 1
             stained = refit(stained, refit_number, refit_number == len(EXACT_STEPS))
-        return stained if self._is_better(tissue, stained, state) else None
+        return self._with_errors(stained, state, solver) if self._is_better(tissue, stained, state) else None
 
-    def sums(self, label: str, tissue: Tissue, seeds: tuple[int, int]) -> StainSums:
-        """Sums over all blocks at a stained tissue, from an image seed and a gradient seed."""
-        assert tissue.stain is not None
-        parts = self.passes.run(
+    def parts(self, label: str, tissue: Tissue, seeds: tuple[int, int]) -> list[StainPart]:
+        """What each block adds at a stained tissue, from an image seed and a gradient seed."""
+        found: list[StainPart] = self.passes.run(
             f"{self.passes.seeds.channel}-{label}",
             tissue,
             self.samples,
@@ -118,12 +139,20 @@ class StainStage:
             similar_tissue(tissue, GRADIENT_G),
             seeds,
         )
-        self.passes.record([row for *_, row in parts])
+        self.passes.record([part.trace for part in found])
+        return found
+
+    def sums(self, parts: Sequence[StainPart], tissue: Tissue) -> StainSums:
+        """Sums over all blocks at a stained tissue."""
+        assert tissue.stain is not None
         touched, a_t = self.layout.index >= 0, tissue.stain.transmittance
-        explained, carried = (
-            sum(((a_t * part[k])[touched] for part in parts), np.zeros(touched.sum())) for k in (0, 1)
+        none = np.zeros(touched.sum())
+        return StainSums(
+            sum(((a_t * part.explained)[touched] for part in parts), none),
+            sum(((a_t * part.carried)[touched] for part in parts), none),
+            sum(part.squares for part in parts),
+            sum(part.count for part in parts),
         )
-        return StainSums(explained, carried, sum(part[2] for part in parts))
 
     def _step(
         self, stage: str, step: int, tissue: Tissue, state: StainState,
@@ -132,7 +161,8 @@ class StainStage:
 
         def compute() -> dict[str, object]:
             seeds = self.passes.seeds(stage, step, "image"), self.passes.seeds(stage, step, "gradient")
-            return solve(state, self.sums(f"{stage}-{step}", self._with_stain(tissue, state), seeds)).record()
+            stained = self._with_stain(tissue, state)
+            return solve(state, self.sums(self.parts(f"{stage}-{step}", stained, seeds), stained)).record()
 
         self.raise_if_cancelled()
         entry, _ = self.journal.get_or_compute(f"{self.passes.seeds.channel}/{stage}/{step}", compute)
@@ -143,6 +173,22 @@ class StainStage:
 
     def _with_stain(self, tissue: Tissue, state: StainState) -> Tissue:
         return replace(tissue, stain=self.layout.texture(state.depth))
+
+    def _with_errors(self, tissue: Tissue, state: StainState, solver: StainSolver) -> Tissue:
+        # One more pass, of the media as the last refit left them.
+        def compute() -> list[float]:
+            seeds = self.passes.seeds("stain.errors", "image"), self.passes.seeds("stain.errors", "gradient")
+            parts = self.parts("stain.errors", tissue, seeds)
+            exits: Any = 0
+            for part, block in zip(parts, self.passes.read_blocks(), strict=True):
+                shares = seen_texels(self.layout, block.view)
+                exits = exits + shares.T @ shares.multiply(part.light[:, None])
+            errors: list[float] = solver.depth_errors(state.depth, self.sums(parts, tissue), exits).tolist()
+            return errors
+
+        self.raise_if_cancelled()
+        errors, _ = self.journal.get_or_compute(f"{self.passes.seeds.channel}/stain.errors", compute)
+        return replace(tissue, stain=self.layout.texture(state.depth, np.array(errors)))
 
     def _is_better(self, plain: Tissue, stained: Tissue, state: StainState) -> bool:
         # Fitted noise lowers F by half a unit per fitted texel, so the texture has to lower F by a whole unit per texel

@@ -40,6 +40,8 @@ SLOWER_AFTER = 3
 """Number of exact steps after which a step is half as long."""
 LONGEST_STEP = 0.7
 """Largest change of a texel's depth in one step: a factor of two."""
+ENTRY_SHARE = 0.25
+"""Curvature of a texel by entry crossings as a share of what they carry, where the remaining step is estimated."""
 CLEAN_SHARE = 0.2
 """Share of the visible surface that counts as clean while depths are known only relative to each other."""
 
@@ -52,6 +54,8 @@ class StainSums:
     carried: Array
     squares: float
     """sum w (r^2 - its Monte Carlo variance)."""
+    count: int = 0
+    """Number of measurements; the weights make ``squares`` as large where only their noise is left."""
 
     def __add__(self, other: StainSums) -> StainSums:
         return StainSums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
@@ -124,6 +128,46 @@ class StainSolver:
             number: number of exact steps before this one.
         """
         return self._stepped(state, sums, sums.explained - sums.carried, 1 + number / SLOWER_AFTER, MOMENTUM, 0.0)
+
+    def depth_errors(self, depth: Array, sums: StainSums, exits: Any) -> Array:
+        """Standard errors (T,) of the depths (T,) at the end of a fit, with the media as they are.
+
+        The covariance is M⁻¹ (s H + c Λ) M⁻¹ + r r', with the prior's precision Λ and M = H + Λ.
+
+        - H is the curvature by exit crossings alone. Entry crossings spread over the texels around, which adds to the
+          curvature of every pattern, so that H is a lower limit.
+        - s >= 1 is the factor by which residuals exceed the noise of the measurements.
+        - c >= 1 is that by which the squares of the depths that the data determine exceed the prior's variance: the
+          prior only smooths, and a stained tooth is darker than it expects.
+        - The remaining step r holds what the steps left and the Monte Carlo noise of the gradient, so that its square
+          is averaged over neighbouring texels. ``ENTRY_SHARE`` of the entry crossings bounds it where a texel is seen
+          by them alone.
+
+        Args:
+            depth: the fitted depths (T,).
+            sums: sums at these depths, from seeds that no step used.
+            exits: sparse matrix (T, T) of sum w C^2 b_t b_u, b being the share of a pixel that shows a texel.
+        """
+        prior, data = self._prior(), exits.toarray()
+        inverse = np.linalg.inv(data + prior.toarray())
+        excess = max(1.0, sums.squares / max(sums.count, 1)) - 1.0
+        noise = excess * np.einsum("ij,ji->i", inverse @ data, inverse)
+        known = data.diagonal() > prior.diagonal()
+        expected = np.linalg.inv(prior.toarray()).diagonal()
+        stained = max(1.0, float(np.mean(depth[known] ** 2 / expected[known]))) if known.any() else 1.0
+        smoothing = (stained - 1.0) * np.einsum("ij,ji->i", inverse @ prior.toarray(), inverse)
+        variance = inverse.diagonal() + noise + smoothing
+        entered = ENTRY_SHARE * np.maximum(sums.carried - data.sum(axis=1), 0.0)
+        gradient = sums.explained - sums.carried + prior @ depth
+        step = np.linalg.solve(data + np.diag(entered) + prior.toarray(), gradient)
+        # A depth that its bound holds at 0 has no step left.
+        square, number = (np.clip(depth - step, 0.0, DEEPEST) - depth) ** 2, np.ones(self.texels)
+        first, second = self.neighbours.T
+        around = square.copy()
+        for ours, theirs in ((first, second), (second, first)):
+            np.add.at(around, ours, square[theirs])
+            np.add.at(number, ours, 1.0)
+        return np.asarray(np.sqrt(variance + around / number))
 
     def _relative(self, before: StainState, moved: StainState) -> StainState:
         # Depths relative to the cleanest part of the visible surface; the media take up the common factor.

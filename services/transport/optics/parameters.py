@@ -66,6 +66,8 @@ class Stain:
 
     transmittance: NDArray[np.float64]
     """a_t, (H, W), above 0 and at most 1; the first row's centre lies at v = 1 / 2H."""
+    se: NDArray[np.float64] | None = None
+    """Standard error (H, W) of a_t; None where none was computed."""
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,16 @@ class StainLayout:
     """Area (T,) of the surface that a texel colours, by its bilinear weights."""
     neighbours: NDArray[np.int64]
     """Pairs (E, 2) of texels that are next to each other on the surface."""
+    outer: Mesh
+    """The surface."""
 
-    def texture(self, optical_depth: Array) -> Stain:
-        """Stain texture of optical depths d (T,), a_t = exp(-d)."""
+    def texture(self, optical_depth: Array, errors: Array | None = None) -> Stain:
+        """Stain texture of optical depths d (T,), a_t = exp(-d), with the standard error of a_t to first order in those
+        of d (T,), and 0 where no surface is.
+        """
         values = np.append(np.exp(-np.asarray(optical_depth, dtype=np.float64)), 1.0)
-        return Stain(values[self.index])
+        own = None if errors is None else (values * np.append(errors, 0.0))[self.index]
+        return Stain(values[self.index], own)
 
     def depths(self, stain: Stain) -> Array:
         """Optical depths (T,) of a stain."""
@@ -112,6 +117,7 @@ def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
         points,
         np.asarray(area[touched], dtype=np.float64),
         _neighbours(points, normals, NEIGHBOUR_DISTANCE * texel_mm),
+        outer,
     )
 
 
@@ -173,6 +179,7 @@ STAINS = "stains.npz"
 def store_stains(folder: Path, stains: ToothStains) -> None:
     """Store stain textures in a fit's folder."""
     arrays = {f"texture.{channel}": stain.transmittance for channel, stain in stains.textures.items()}
+    arrays |= {f"se.{channel}": stain.se for channel, stain in stains.textures.items() if stain.se is not None}
     np.savez_compressed(folder / STAINS, allow_pickle=False, corners_uv=stains.corners_uv, **arrays)
 
 
@@ -182,8 +189,11 @@ def read_stains(folder: Path) -> ToothStains | None:
         return None
     with np.load(folder / STAINS, allow_pickle=False) as stored:
         textures = {
-            name.removeprefix("texture."): Stain(stored[name].astype(float))
-            for name in stored.files
-            if name.startswith("texture.")
+            channel: Stain(
+                stored[f"texture.{channel}"].astype(float),
+                stored[f"se.{channel}"].astype(float) if f"se.{channel}" in stored.files else None,
+            )
+            for kind, _, channel in (name.partition(".") for name in stored.files)
+            if kind == "texture"
         }
         return ToothStains(stored["corners_uv"].astype(float), textures)

@@ -292,7 +292,8 @@ class ChannelSchedule(Stages[Tissue]):
                 self._evaluate_and_report(stage, step, stained, samples, verdict)
 
         stage = StainStage(self.passes, self.journal, layout, samples, self.raise_if_cancelled, report)
-        return last if stage.run(tissue, refit) is not None else (problem, tissue, solution)
+        kept = stage.run(tissue, refit)
+        return (problem, tissue, solution) if kept is None else (last[0], kept, last[2])
 
     def _domain(self, leaves: tuple[str, ...]) -> Domain:
         # Domain of the media's parameters that are not held.
