@@ -17,7 +17,7 @@ from services.assets.colour.beside_picture import picture
 from services.assets.fitted_job import FittedJob
 from services.assets.provenance.departing import BESIDE_PHOTOGRAPH, COLOUR_DIFFERENCES
 from services.core.errors import CorruptStoreError
-from services.core.geometry import Camera, Light
+from services.core.geometry import Camera, Light, Mesh
 from services.core.pages.pictures import Picture, png_bytes
 from services.core.store import StoredArray, write_atomic
 
@@ -25,21 +25,27 @@ DIFFERENCES = TypeAdapter(list[ColourDifference])
 
 
 def write_lead_picture(
-    folder: Path, job: FittedJob, cameras: tuple[Camera, ...], lights: tuple[Light, ...]
+    folder: Path,
+    job: FittedJob,
+    cameras: tuple[Camera, ...],
+    lights: tuple[Light, ...],
+    gums: Mesh | None = None,
+    cavity: Mesh | None = None,
 ) -> tuple[str, ...]:
     """Write ``render_beside_photograph.png`` and ``colour_differences.json``, and return their names.
 
-    Nothing is written of a jaw, of stained teeth, and of jobs without red, green and blue.
+    Nothing is written of stained teeth and of jobs without red, green and blue.
 
     Args:
         folder: the asset's folder.
         job: the fitted job.
         cameras, lights: those of the asset, in its frame.
+        gums, cavity: of a jaw, what its teeth stand in and what is behind them.
     """
     if job.stains is not None:
         return ()
     radiance = StoredArray(job.prepared_folder / "prepared.zarr" / "radiance")
-    shown = Shown(job.teeth, cameras, lights, middle_of(job.teeth))
+    shown = Shown(job.teeth, cameras, lights, middle_of(job.teeth), gums, cavity)
     found = beside(job.spec, job.report, job.prepared, radiance, shown)
     if found is None:
         return ()

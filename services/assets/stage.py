@@ -88,7 +88,8 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         colours=CapturedColours(prepared.channels, prepared.colour) if prepared.colour else None,
     )
     write_record(writer.folder / PROVENANCE, provenance)
-    files = tuple(sorted((*files, PROVENANCE, *write_lead_picture(writer.folder, job, cameras, lights))))
+    lead = write_lead_picture(writer.folder, job, cameras, lights, gums, cavity)
+    files = tuple(sorted((*files, PROVENANCE, *lead)))
 
     write_job_report(context.root / "report.html", job, writer.folder, provenance)
     write_atomic(context.root / "parameters.json", _json(parameters_json(report)))

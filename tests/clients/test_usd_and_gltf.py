@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -168,6 +169,15 @@ def test_the_script_for_blender_has_the_names_and_coordinates_of_the_textures(jo
 def test_the_validators_find_nothing_in_usd_and_materialx(job: Path) -> None:
     assert findings("pxr", job / "asset-usd/asset.usda") == []
     assert findings("MaterialX", job / "asset-usd/asset.mtlx") == []
+
+
+@pytest.mark.parametrize("published_as", [published_object, published_mouth, published_slab])
+def test_the_validators_find_nothing_in_an_object_a_mouth_and_a_slab(
+    published_as: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    (folder,) = export_to(published_as(tmp_path), ("usd",))
+    assert findings("pxr", folder / "asset.usda") == []
+    assert findings("MaterialX", folder / "asset.mtlx") == []
 
 
 @pytest.mark.parametrize(

@@ -356,7 +356,10 @@ def test_the_gallery_shows_a_tooth_on_a_table(tooth: Path, tmp_path: Path) -> No
     from services.bench.figures.gallery import main
 
     with variant("llvm_ad_rgb"):
-        status = main(["--out", str(tmp_path), "--views", "front", "backlit", "--size", "20", "25", "--samples", "32"])
+        status = main(
+            ["--out", str(tmp_path), "--views", "front", "backlit", "--surfaces", "thin", "--size", "20", "25",
+             "--samples", "32"]
+        )  # fmt: skip
     assert status == 0
     front, backlit = (png_pixels(tmp_path / f"{view}.png").astype(float) for view in ("front", "backlit"))
     assert front.shape == (25, 20, 3)

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.asset import tissue_of
+from services.assets.asset import mouth_of, tissue_of
 from services.assets.colour.develop import CapturedColours, developed, diffuser_radiance
+from services.assets.colour.seen import Surfaces, seen
 from services.assets.colour.smoothing import smoothed_colours, smoothed_halves
 from services.assets.colour.spaces import LINEAR_SRGB
 from services.assets.content import RGB
-from services.core.geometry import Camera, Light, Tooth, Vector3
+from services.core.geometry import Camera, Light, Mesh, Tooth, Vector3
 from services.core.records import JobSpec
 from services.core.results import FitReport, PreparedManifest
 from services.core.store import StoredArray
@@ -36,9 +37,7 @@ MARGIN_PX = 2
 SMOOTHED_SHARE = 1 / 25
 """Radius of the filter's squares, as a share of the picture's larger side: some 0.6 mm of a tooth."""
 FILLED = 0.99
-"""Least share of a pixel that the surface covers where photograph and render are compared."""
-SUBPIXELS = 3
-"""Rays along each side of a pixel that tell how much of it shows the surface."""
+"""Least share of a pixel that teeth, or the object, cover where photograph and render are compared."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class Pair:
     render_noise: Floats
     """Covariance (3, 3) of the render's noise in red, green and blue, relative to itself."""
     compared: NDArray[np.bool_]
-    """Pixels (h, w) of the photograph that the surface fills."""
+    """Pixels (h, w) of the photograph that teeth, or the object, fill."""
 
     @property
     def lit(self) -> str:
@@ -89,6 +88,13 @@ class Shown:
     """``intensity`` in the order of the fitted channels."""
     middle_mm: Vector3
     """Where the white diffuser is."""
+    gums: Mesh | None = None
+    cavity: Mesh | None = None
+
+    @property
+    def surfaces(self) -> Surfaces:
+        """What a camera may see."""
+        return Surfaces(self.teeth, self.gums, self.cavity)
 
 
 def beside(
@@ -101,12 +107,12 @@ def beside(
         radiance: photographs (K, L, H, W, C) in the order of the preparation.
 
     Returns:
-        None of several teeth, and where red, green and blue were not all fitted.
+        None where red, green and blue were not all fitted.
     """
     channels = tuple(report.parameters)
-    if report.teeth or not set(RGB) <= set(channels):
+    if not set(RGB) <= set(channels):
         return None
-    covers = [_surface(camera, shown)[1] for camera in shown.cameras]
+    covers = [seen(camera, shown.surfaces).teeth for camera in shown.cameras]
     number = int(np.argmax([float(cover.sum()) for cover in covers]))
     camera, paths = shown.cameras[number], PATHS * min(1.0, spec.samples_per_pixel / USUAL_SAMPLES)
     crop = _crop(covers[number])
@@ -122,21 +128,25 @@ def beside(
     white = np.array([np.broadcast_to(diffuser_radiance(one, shown.middle_mm), len(channels))[own] for one in lights])
     order = [prepared.channels.index(channel) for channel in RGB]
     photos = [_photo(radiance, number, k, crop, smaller)[..., order] / white[n] for n, k in enumerate(used)]
-    normals, covered = _surface(film, shown)
-    renders, samples = _renders(spec, report, shown, film, lights, choices, covered, paths)
+    view = seen(film, shown.surfaces)
+    renders, samples = _renders(spec, report, shown, film, lights, choices, view.covered, paths)
     colours = CapturedColours(RGB, prepared.colour or {}).cameras.get(camera.name)
     radius, times = max(2, round(SMOOTHED_SHARE * max(film.size))), film.size[1] // photos[0].shape[0]
-    filled = square_means(covered, times) > FILLED
+    filled = square_means(view.teeth, times) > FILLED
 
     def pair(choice: NDArray[np.intp], render: Floats) -> Pair:
-        halves = smoothed_halves(render, normals, covered, radius)
+        halves = view.by_part(lambda own, cover: np.stack(smoothed_halves(own, view.normals, cover, radius)), render)
         one, two = (developed(square_means(half, times)[filled], colours, LINEAR_SRGB) for half in halves)
         deviation = (one - two) / np.maximum(one + two, 1e-12)
         return Pair(
             tuple(lights[k].name for k in choice),
             bool(unseen[choice].all()),
             developed(np.mean([photos[k] for k in choice], axis=0), colours, LINEAR_SRGB),
-            developed(smoothed_colours(render, normals, covered, radius), colours, LINEAR_SRGB),
+            developed(
+                view.by_part(lambda own, cover: smoothed_colours(own, view.normals, cover, radius), render),
+                colours,
+                LINEAR_SRGB,
+            ),
             deviation.T @ deviation / max(1, len(deviation)),
             filled,
         )
@@ -149,21 +159,6 @@ def square_means(values: Floats, edge: int) -> Floats:
     """Means of an image (H, W, ...) over squares of pixels."""
     height, width = (size // edge for size in values.shape[:2])
     return np.asarray(values.reshape(height, edge, width, edge, *values.shape[2:]).mean(axis=(1, 3)))
-
-
-def _surface(camera: Camera, shown: Shown) -> tuple[Floats, Floats]:
-    """Mean normals (H, W, 3) of what a camera sees of the surface, and the covered share (H, W) of each pixel."""
-    from services.transport.rays import RayScene, pixel_rays
-
-    scene, (width, height) = RayScene(*(tooth.outer for tooth in shown.teeth)), camera.size
-    normals, covered = np.zeros((width * height, 3)), np.zeros(width * height)
-    for k in range(SUBPIXELS**2):
-        offset = (k % SUBPIXELS + 0.5) / SUBPIXELS, (k // SUBPIXELS + 0.5) / SUBPIXELS
-        hits = scene.first_hits(*pixel_rays(camera, offset))
-        normals[hits.hit] += hits.normals[hits.hit]
-        covered += hits.hit / SUBPIXELS**2
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return normals.reshape(height, width, 3), covered.reshape(height, width)
 
 
 def _crop(covered: Floats) -> tuple[slice, slice]:
@@ -213,19 +208,25 @@ def _renders(
     """
     from services.anatomy.dentin_shape import DentinShape
     from services.transport.engine import Engine
-    from services.transport.scene.recipe import View, single_tooth
+    from services.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 
-    (tooth,) = shown.teeth
+    order = [int(fdi) for fdi in report.teeth] or [tooth.fdi for tooth in shown.teeth]
+    teeth = tuple(
+        ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape.known(tooth.dentin))
+        for tooth in sorted(shown.teeth, key=lambda tooth: order.index(tooth.fdi))
+    )
     pixels = np.argwhere(covered > 0)[:, ::-1].astype(np.int32)
     samples = max(1, round(paths / len(choices) / max(1, len(pixels))))
     images = [np.zeros((*covered.shape, 3)) for _ in choices]
     positions = np.array([light.position_mm for light in lights])
     # A perfect diffuser that faces a light of this intensity has the radiance 1.
     intensities = np.pi * np.sum((positions - np.array(shown.middle_mm)) ** 2, axis=1)
-    dentin = None if tooth.dentin is None else DentinShape.known(tooth.dentin)
     for k, channel in enumerate(RGB):
-        recipe = single_tooth(tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device)
-        engine, tissue = Engine(recipe.with_surface(report.surface)), tissue_of(report.parameters[channel])
+        recipe = SceneRecipe(
+            teeth, positions, intensities, spec.boundary, spec.ior, spec.device, gums=shown.gums, cavity=shown.cavity
+        )
+        tissue = mouth_of(report, channel) if report.teeth else tissue_of(report.parameters[channel])
+        engine = Engine(recipe.with_surface(report.surface))
         for image, choice in zip(images, choices, strict=True):
             view = View(film, pixels, tuple(choice.tolist()))
             found = engine.images(tissue, view, seed=spec.seed, samples=samples, batches=1).mean

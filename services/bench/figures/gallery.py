@@ -1,9 +1,10 @@
 """Pictures of a tooth in an ordinary Mitsuba scene, by the ``dentine`` integrator.
 
-``python -m services.bench.figures.gallery --out DIR`` puts an incisor on a table and writes one PNG per view. The
-options ``--outer`` and ``--dentin`` give another tooth and ``--environment`` other surroundings. With ``--scene
-FILE.xml --enamel ID --core ID`` the shapes of these ids in your own scene become a tooth, and every sensor gives a
-picture.
+``python -m services.bench.figures.gallery --out DIR`` puts an incisor on a table and writes one PNG per view and
+surface, and ``gallery.png`` with all: above the thin boundary, which does not refract, and below a rough dielectric of
+the same index and media. The options ``--outer`` and ``--dentin`` give another tooth and ``--environment`` other
+surroundings. With ``--scene FILE.xml --enamel ID --core ID`` the shapes of these ids in your own scene become a tooth,
+and every sensor gives a picture.
 """
 
 from __future__ import annotations
@@ -21,18 +22,21 @@ from numpy.typing import NDArray
 
 from services.anatomy.frame import estimate_frame
 from services.anatomy.templates.incisor import build_incisor
+from services.bench.figures.mosaic import Column, mosaic
 from services.core.errors import DentineError, InputError, NonFiniteError
 from services.core.files.meshes import read_mesh, write_mesh
 from services.core.geometry import Mesh, Vector3
 from services.core.pages.pictures import png_bytes, tone_map, white_level
 from services.core.store import write_atomic
-from services.fit.coordinates.domain import similar_medium
+from services.fit.coordinates.domain import similar_medium, similar_tissue
 from services.phantom.tooth import TRUE_TISSUE
 from services.transport.platform import prepare_device
 
 SceneDict = dict[str, Any]
 Image = NDArray[np.float64]
 
+SURFACES = {"thin": "", "rough": "-rough"}
+"""Surfaces of the tooth in the pictures, in the order of their rows, and the ending that each adds to a file's name."""
 COLUMNS = 120
 """Columns of the procedural incisor's mesh: enough for an outline without visible corners."""
 ROUGHNESS = 0.12
@@ -42,6 +46,9 @@ TABLE_GAP_MM = 0.02
 SIMILAR_G = 0.25
 """Mean cosine of the similar media with which pictures are rendered. They are 1 to 3 % darker here, and cost about a
 sixth for equal noise."""
+ROUGH_DIVISOR = 8
+"""Divisor of the paths per pixel of the rough surface, whose pictures are smoothed and have a render for each channel.
+"""
 PASS_SAMPLES = 32
 """Paths per pixel of one pass of a render."""
 SIZE_PX = (320, 400)
@@ -227,9 +234,13 @@ def render(scene: Any, integrator: SceneDict, samples: int, sensor: int = 0, see
 
 
 def table_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, float]]:
-    """Yield the name, the radiance and the white level of each view of a tooth on a table."""
+    """Yield the name, the radiance and the white level of each view of a tooth on a table, with each surface."""
     import mitsuba as mi
 
+    from services.bench.figures.refracting import refracting_picture
+
+    exact = tuple(TRUE_TISSUE.values())
+    tissues = exact if options.exact else tuple(similar_tissue(tissue, SIMILAR_G) for tissue in exact)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         surfaces = tooth_surfaces(options.outer, options.dentin, options.buccal)
@@ -237,8 +248,12 @@ def table_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, fl
             write_mesh(folder / f"{surface}.ply", mesh)
         integrator = tooth_integrator("enamel", "dentin" if "dentin" in surfaces else None, exact=options.exact)
         for view in options.views:
-            scene = mi.load_dict(gallery_scene(VIEWS[view], folder, options.environment, options.size), optimize=False)
-            yield view, render(scene, integrator, options.samples), VIEWS[view].white
+            scene, white = gallery_scene(VIEWS[view], folder, options.environment, options.size), VIEWS[view].white
+            if "thin" in options.surfaces:
+                yield view, render(mi.load_dict(scene, optimize=False), integrator, options.samples), white
+            if "rough" in options.surfaces:
+                samples = max(1, options.samples // ROUGH_DIVISOR)
+                yield view + SURFACES["rough"], refracting_picture(scene, tissues, ROUGHNESS, samples), white
 
 
 def own_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, float]]:
@@ -272,7 +287,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--views", nargs="+", choices=tuple(VIEWS), default=tuple(VIEWS), help="which views (default: all)"
     )
-    parser.add_argument("--samples", type=int, default=256, help="paths per pixel (default: 256)")
+    parser.add_argument(
+        "--surfaces",
+        nargs="+",
+        choices=tuple(SURFACES),
+        default=tuple(SURFACES),
+        help="thin does not refract, rough is a rough dielectric; not with --scene (default: both)",
+    )
+    parser.add_argument("--samples", type=int, default=256, help="paths per pixel, an eighth for rough (default: 256)")
     parser.add_argument(
         "--size", type=int, nargs=2, metavar=("W", "H"), default=SIZE_PX, help="pixels (default: 320 400)"
     )
@@ -308,9 +330,17 @@ def main(arguments: list[str] | None = None) -> int:
 
         register_integrator()
         options.out.mkdir(parents=True, exist_ok=True)
+        drawn = {}
         for name, image, white in own_pictures(options) if options.scene is not None else table_pictures(options):
+            drawn[name] = tone_map(image, white)
             path = options.out / f"{name}.png"
-            write_atomic(path, png_bytes(tone_map(image, white)))
+            write_atomic(path, png_bytes(drawn[name]))
+            print(path, flush=True)
+        if options.scene is None:
+            shown = [name for name in SURFACES if name in options.surfaces]
+            rows = [[drawn[view + SURFACES[name]] for view in options.views] for name in shown]
+            path = options.out / "gallery.png"
+            write_atomic(path, png_bytes(mosaic(rows, [Column(view) for view in options.views], shown, scale=1)))
             print(path, flush=True)
     except DentineError as problem:
         print(f"gallery: {problem.message}", file=sys.stderr)
