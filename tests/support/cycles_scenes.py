@@ -24,6 +24,14 @@ from tests.support.clients import run_client
 Array = NDArray[np.float64]
 IOR = 1.631
 LAMP = Light(name="l0", position_mm=(150.0, 600.0, 250.0), intensity=(1e6, 1e6, 1e6))
+WIDE_LAMP_DEG = (40.0, 50.0)
+"""Angles from the middle of a wide lamp at which its radiance begins to fall from 1, and is that of the room."""
+ROOM = 0.05
+"""Radiance from all other directions; stock Mitsuba gives NaN for single paths where a picture is black."""
+WIDE_LAMP = "wide_lamp.exr"
+"""Name of its picture, an environment, in an asset's folder."""
+WIDE_LAMP_ROWS = 128
+"""Height of that picture, pixels, which renderers interpolate: its edge is seven of them wide."""
 CHANNELS = ("red", "green", "blue")
 
 
@@ -35,7 +43,9 @@ class Case:
     dentin: Mesh | None
     tissues: tuple[Tissue, ...]
     camera: Camera
-    lit_by: Literal["sky", "lamp"] = "sky"
+    lit_by: Literal["sky", "lamp", "wide lamp"] = "sky"
+    """A wide lamp is far away in the direction of ``lamp``: light that scattered inside finds it by chance too, so that
+    its pictures need a tenth of the paths that a point needs."""
     boundary: Boundary = "matched"
     roughness: float = 0.15
     """Of boundary ``rough``, without light that meets several facets, which stock Mitsuba loses."""
@@ -97,6 +107,22 @@ def write_case(folder: Path, case: Case, stains: ToothStains | None = None) -> N
         stains=stains,
     )
     write_scripts(folder)
+    if case.lit_by == "wide lamp":
+        import mitsuba as mi
+
+        mi.Bitmap(np.repeat(wide_lamp()[0][..., None], 3, axis=-1).astype(np.float32)).write(str(folder / WIDE_LAMP))
+
+
+def wide_lamp() -> tuple[Array, float]:
+    """The wide lamp as an equirectangular picture (H, 2 H), and the radiance of a perfect diffuser that faces it."""
+    rows = (np.arange(WIDE_LAMP_ROWS) + 0.5) / WIDE_LAMP_ROWS
+    up, around = np.pi * (0.5 - rows)[:, None], 2 * np.pi * (0.5 - (np.arange(2 * len(rows)) + 0.5) / (2 * len(rows)))
+    directions = np.stack(np.broadcast_arrays(np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), -1)
+    cosine = directions @ np.array(LAMP.position_mm) / np.linalg.norm(LAMP.position_mm)
+    inner, outer = np.cos(np.radians(WIDE_LAMP_DEG))
+    radiance = ROOM + (1 - ROOM) * np.clip((cosine - outer) / (inner - outer), 0.0, 1.0)
+    pixel_sr = np.cos(up) * (np.pi / len(rows)) ** 2
+    return radiance, float((radiance * np.maximum(cosine, 0.0) * pixel_sr).sum() / np.pi)
 
 
 def cycles_image(folder: Path, case: Case, samples: int, seed: int, *words: str) -> Array:
@@ -104,7 +130,9 @@ def cycles_image(folder: Path, case: Case, samples: int, seed: int, *words: str)
     import mitsuba as mi
 
     picture = folder / f"cycles-{seed}.exr"
-    lit = ("--light", "none", "--sky", "1") if case.lit_by == "sky" else ("--light", case.lamp.name)
+    lit: tuple[str, ...] = ("--light", case.lamp.name) if case.lit_by == "lamp" else ("--light", "none", "--sky", "1")
+    if case.lit_by == "wide lamp":
+        lit = (*lit, "--environment", str(folder / WIDE_LAMP))
     done = run_client(
         "bpy",
         folder / "blender" / "blender_scene.py",
@@ -160,6 +188,10 @@ def mitsuba_image(folder: Path, case: Case, samples: int, seed: int, *, fits: bo
             )
             if case.lit_by == "sky":
                 scene["light"] = {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}
+            if case.lit_by == "wide lamp":
+                # The picture's top is up, its middle looks along x, and its left half along y, as Blender has it.
+                turn = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
+                scene["light"] = {"type": "envmap", "filename": str(folder / WIDE_LAMP), "to_world": np.array(turn)}
             if case.glass is not None:
                 scene = as_dielectric(scene)
                 scene["outer_11"]["bsdf"] = case.glass
