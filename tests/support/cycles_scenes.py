@@ -45,7 +45,7 @@ class Case:
     camera: Camera
     lit_by: Literal["sky", "lamp", "wide lamp"] = "sky"
     """A wide lamp is far away in the direction of ``lamp``: light that scattered inside finds it by chance too, so that
-    its pictures need a tenth of the paths that a point needs."""
+    its pictures need less than half of the paths that a point needs."""
     boundary: Boundary = "matched"
     roughness: float = 0.15
     """Of boundary ``rough``, without light that meets several facets, which stock Mitsuba loses."""
