@@ -33,8 +33,8 @@ _BENCHMARKS = MappingProxyType(
         "transport-stack": "services.bench.transport.stack:run",
     }
 )
-"""Name -> ``module:function``; the function takes ``quick``, returns JSON values, and may also take ``case``, and
-``keep``, which stores unfinished rows."""
+"""Name -> ``module:function``; the function takes ``quick``, returns JSON values, and may also take ``case``,
+``keep``, which stores unfinished rows, and ``state``, a folder from which a benchmark that was killed goes on."""
 
 
 def bench(
@@ -68,6 +68,8 @@ def bench(
             options["case"] = case
         if "keep" in accepted and json_file is not None and name != "all":
             options["keep"] = lambda rows: json_file.write_text(json.dumps(rows, indent=1) + "\n")
+        if "state" in accepted and json_file is not None:
+            options["state"] = json_file.with_suffix(".state")
         results[one] = measure(**options)
     text = json.dumps(results if name == "all" else results[name], indent=1)
     print(text)

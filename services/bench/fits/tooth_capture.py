@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,9 +99,8 @@ class PreparedTooth:
     observations: Observations
     views: tuple[ViewStack, ...]
     engine: Engine
-    truth: Mapping[str, float] = field(default_factory=dict)
-    """True reduced scattering coefficients, per mm, by ``enamel.sigma_s_reduced`` and ``dentin.sigma_s_reduced``; empty
-    where they are not known."""
+    truth: Tissue | None = None
+    """The true media; None where they are not known."""
 
     def errors(self, tissue: Tissue | Mouth, *, samples: int, seed: int) -> tuple[ErrorSums, ErrorSums]:
         """Return the error sums on fitted and on held-out images, from two renders of so many paths per pixel."""
@@ -169,10 +169,21 @@ def smallest_case(folder: Path, *, pixel_step: int = 1, seed: int = 1) -> Prepar
         "pixel_step": pixel_step,
         "seed": seed,
     }
-    known = json.loads((source / "truth.json").read_text())
-    media = known["channels"][CHANNEL] if "channels" in known else known
-    truth = {f"{part}.sigma_s_reduced": float(media[part]["sigma_s_reduced"]) for part in ("enamel", "dentin")}
+    truth = true_tissue(json.loads((source / "truth.json").read_text()))
     return replace(prepared_tooth(folder / "job", JobSpec.model_validate(options)), truth=truth)
+
+
+def true_tissue(known: Mapping[str, Any]) -> Tissue:
+    """Return the media that ``truth.json`` tells, of a phantom or of the scanned incisor, whose names are Mitsuba's."""
+    media = known["channels"][CHANNEL] if "channels" in known else known
+
+    def medium(values: Mapping[str, float]) -> Medium:
+        if "sigma" in values:
+            return Medium(values["sigma"], values["alpha"], values["beta"], values["g1"], values["g2"])
+        g1 = values["g1"] if "g1" in values else values["g"]
+        return Medium(values["sigma_t"], values["albedo"], values.get("beta", 1.0), g1, values.get("g2", 0.0))
+
+    return Tissue(medium(media["enamel"]), medium(media["dentin"]))
 
 
 def tissue_of(values: Mapping[str, float]) -> Tissue:
