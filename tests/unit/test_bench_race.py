@@ -168,8 +168,9 @@ def test_rows_hold_every_parameter_and_the_image_to_its_levels() -> None:
     assert (other.by_s, other.lowest_ratio) == (None, 300.0 / 20.0)
     assert found[HELD_OUT, 0.03, PEER].by_s is None, "its only image is its last iterate, in the last fifth"
     text = table(rows)
-    assert {len(line.split("|")) for line in text} == {5}
-    assert text[2].startswith("| all four parameters 20; 1±0 | 10–20 s | not by 300 s; over 15 × |")
+    assert text[0] == f"| error kept, % | floor, % | {OURS} | {PEER} |"
+    assert text[2] == "| all four parameters 20/10/5 | 1±0 | 20/20/20 | >300/>300/>300 |"
+    assert len(text) == 2 + len(LEVELS)
     assert "dentin σs' to 20 %, mitsuba-prbvolpath-adam: dentine is over 15 times as fast." in sentences(rows)
     assert not sentences(rows)[-1].startswith("This race decides nothing")
 

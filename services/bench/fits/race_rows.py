@@ -132,33 +132,23 @@ def level_row(quantity: str, level: float, floor: float, peer: str, spans: dict[
 
 
 def table(rows: Sequence[FloorRow | LevelRow]) -> list[str]:
-    """Lines of a table in Markdown: processor seconds of each peer to each level."""
+    """Lines of a table in Markdown: by quantity, the processor seconds after which each solver kept its levels; behind
+    ``>`` the last time at which it was surely above a level that it did not surely keep.
+    """
     levels = [row for row in rows if isinstance(row, LevelRow)]
-    floors = {row.quantity: row for row in rows if isinstance(row, FloorRow)}
     peers = list(dict.fromkeys(row.peer for row in levels))
-    lines = [f"| error kept, %; floor | {' | '.join(peers)} |", "|---" * (len(peers) + 1) + "|"]
-    for quantity, level in dict.fromkeys((row.quantity, row.error) for row in levels):
-        own = {row.peer: row for row in levels if (row.quantity, row.error) == (quantity, level)}
-        floor = floors[quantity]
-        name = f"{WORDS[quantity]} {100 * level:g}; {100 * floor.error:.2g}±{100 * floor.error_se:.1g}"
-        lines.append(f"| {name} | {' | '.join(_cell(own[peer]) for peer in peers)} |")
+    lines = [f"| error kept, % | floor, % | {' | '.join(peers)} |", "|---" * (len(peers) + 2) + "|"]
+    for floor in (row for row in rows if isinstance(row, FloorRow)):
+        own = [row for row in levels if row.quantity == floor.quantity]
+        names = "/".join(f"{100 * level:g}" for level in dict.fromkeys(row.error for row in own))
+        cells = ["/".join(_time(row) for row in own if row.peer == peer) for peer in peers]
+        allowed = f"{100 * floor.error:.2g}±{100 * floor.error_se:.1g}"
+        lines.append(f"| {WORDS[floor.quantity]} {names} | {allowed} | {' | '.join(cells)} |")
     return lines
 
 
-def _cell(row: LevelRow) -> str:
-    if row.by_s is None:
-        time = f"not by {row.after_s:.0f} s" if row.after_s > 0 else "not surely"
-    else:
-        time = f"{row.after_s:.0f}–{row.by_s:.0f} s" if row.after_s > 0 else f"by {row.by_s:.0f} s"
-    if row.peer == OURS:
-        return time
-    if row.lowest_ratio is None:
-        return f"{time}; undecided"
-    return (
-        f"{time}; over {row.lowest_ratio:.2g} ×"
-        if row.highest_ratio is None
-        else (f"{time}; {row.lowest_ratio:.2g} to {row.highest_ratio:.2g} ×")
-    )
+def _time(row: LevelRow) -> str:
+    return f">{row.after_s:.0f}" if row.by_s is None else f"{row.by_s:.0f}"
 
 
 def sentences(rows: Sequence[FloorRow | LevelRow]) -> list[str]:

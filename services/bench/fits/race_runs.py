@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,9 @@ from services.transport.optics.parameters import MEDIUM_FIELDS, Tissue
 
 OURS = "dentine"
 FIRST_SAMPLES = 64
-"""Paths per pixel of the first two renders that measure an iterate's images; they double until enough is known."""
+"""Paths per pixel of the first two renders that measure an iterate's images."""
+SAMPLES_GROWTH = 4
+"""Factor by which they grow until enough is known; the renders before then cost a third of the last one."""
 MARK_GROWTH = 1.5
 """Ratio of the times of two successive iterates whose images are compared."""
 
@@ -120,7 +123,10 @@ class RaceState:
     def stored(self, fresh: Run) -> Run:
         """The stored run of this name, or the given one where there is none."""
         file = self._file(fresh)
-        return read_record(file, Run) if file.is_file() else fresh
+        if not file.is_file():
+            return fresh
+        print(f"{fresh.name} goes on from {file}; delete its folder to run the race anew.", file=sys.stderr)
+        return read_record(file, Run)
 
     def keep(self, run: Run) -> Run:
         """Store a run, and return it."""
@@ -223,11 +229,11 @@ def image_errors(case: PreparedTooth, run: Run, point: int, levels: Sequence[flo
         # The photographs' noise changes the squared error by the square of what they resolve.
         by_photographs = case.resolution() ** 2 / (2 * max(error, case.resolution()))
         se = math.hypot(held_out.error_se or 0.0, by_photographs)
-        if is_known(Measured(0.0, error, se), levels) or 2 * samples > max_samples:
+        if is_known(Measured(0.0, error, se), levels) or SAMPLES_GROWTH * samples > max_samples:
             return ImageErrors(
                 point=point, held_out=error, held_out_se=se, fitted=fitted.resolved_error or 0.0, samples=samples
             )
-        samples *= 2
+        samples *= SAMPLES_GROWTH
 
 
 def with_images(case: PreparedTooth, run: Run, state: RaceState, levels: Sequence[float], max_samples: int) -> Run:

@@ -59,8 +59,9 @@ TUTORIAL = StockRecipe("mitsuba-prbvolpath-adam", 16, Medium(6.0, 0.99, g1=0.8))
 TEETH_2018 = StockRecipe("teeth-2018-recipe", 64, Medium(6.0, 0.99, 0.9, 0.8, 0.0), homogeneous_rounds=8)
 """What teeth 2018 says of its optimisation (section 6), with stock Mitsuba in place of its own integrator: Adam on all
 parameters of two lobes of both media, 64 paths per pixel, L2 loss, image and derivative with seeds of their own, first
-a homogeneous tooth, then both media. Its start from a table of 50,000 renders is replaced by the other peer's, which
-takes no time, and its learning rate, which it does not tell, by several of which each level counts the fastest."""
+a homogeneous tooth, then both media. Two things differ: it searches its start in a table of 50,000 renders, and here it
+begins where the other peer does, which takes no time; and it does not tell its learning rate, nor whether a step sees
+all images, as it does here."""
 
 
 class StockFit:
