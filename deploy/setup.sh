@@ -39,8 +39,7 @@ prepare_packages() {
             die "python3 -m venv does not work here; install python3-venv."
     fi
     say "installing packages into .venv"
-    # What is imported is compiled then: compiling all of it here takes a sixth of this step.
-    .venv/bin/python -m pip install --quiet --no-compile --editable '.[dev]' </dev/null
+    .venv/bin/python -m pip install --quiet --editable '.[dev]' </dev/null
     rm -f .venv/.installed-*
     touch "$stamp"
 }
