@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from services.assets.colour.smoothing import smoothed_colours
 from services.assets.mitsuba.rough_surface import rough_surface
 from services.assets.mitsuba.scene import MAX_DEPTH, ROULETTE_DEPTH, medium_dict
+from services.phantom.surface import IOR
 from services.phantom.tooth import INK
 from services.transport.optics.parameters import Medium, Tissue
 
 SceneDict = dict[str, Any]
 Image = NDArray[np.float64]
 
-IOR = 1.631
-"""Refractive index of enamel."""
 RADIUS = 1 / 24
 """Radius of the smoothing filter as a share of the picture's width."""
 BRIGHTEST = 0.99
