@@ -25,8 +25,9 @@ class Closing:
     """Kind of each of the last changes in ``sums`` (``covariance.uncertainty``)."""
     step: Array
     """The step (F,) from x that follows; zeros before it is made."""
-    remaining: float = 1.0
-    """Share of the step that remains after it that may be true: less than 1 where comparisons refuted the whole."""
+    remaining: float = 0.0
+    """Share of the step that remains after it that may be true: less than 1 where comparisons refuted the whole, and 0
+    before the step is made."""
 
     def record(self) -> dict[str, Any]:
         """The estimate without its step as JSON values."""
