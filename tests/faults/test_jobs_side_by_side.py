@@ -125,6 +125,7 @@ def test_a_cancel_that_stops_a_worker_leaves_the_other_jobs(own_workers: HeldJob
     assert (fit["attempt"], (other_steering / "at-fit-end").read_text()) == (1, pid)
 
 
+@pytest.mark.dear("Six jobs go through a server, which tells of each why it waits.")
 def test_what_a_queued_job_waits_for_is_told(
     system: SmallSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

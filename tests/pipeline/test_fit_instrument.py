@@ -121,6 +121,7 @@ def test_a_gain_that_is_off_moves_the_media_as_the_linear_model_predicts(tmp_pat
         assert abs(moved[name]) == pytest.approx(predicted[name], abs=0.3), name
 
 
+@pytest.mark.dear("Two pairs of fits from two seeds, each with and without more paths.")
 def test_rendering_that_blurs_a_result_gets_more_paths_for_its_gradient(tmp_path: Path) -> None:
     found = []
     for largest, seed in itertools.product((1.0, 0.01), (1, 2)):
