@@ -220,10 +220,11 @@ def test_a_race_goes_on_from_what_is_stored(tmp_path: Path) -> None:
     assert state.floor(lambda: pytest.fail("measured twice")) == floor
 
 
-def test_the_state_of_another_race_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("changed", [{"limit_s": 20.0}, {"numerics": SETTINGS.numerics + 1}])
+def test_the_state_of_another_race_is_refused(tmp_path: Path, changed: dict[str, float]) -> None:
     RaceState(tmp_path).open(SETTINGS)
-    with pytest.raises(InputError, match="holds the state of another race; delete it"):
-        RaceState(tmp_path).open(SETTINGS.model_copy(update={"limit_s": 20.0}))
+    with pytest.raises(InputError, match="holds the state of another race or version; delete it"):
+        RaceState(tmp_path).open(SETTINGS.model_copy(update=changed))
 
 
 def test_floor_is_that_of_a_linear_fit() -> None:

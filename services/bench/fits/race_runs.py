@@ -17,6 +17,7 @@ from services.core.errors import InputError
 from services.core.geometry import Record
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import read_record, write_record
+from services.transport.numerics import NUMERICS
 from services.transport.optics.parameters import MEDIUM_FIELDS, Tissue
 
 OURS = "dentine"
@@ -81,7 +82,7 @@ class Run(Record):
 
 
 class Settings(Record):
-    """How large a race is, on which its stored runs depend."""
+    """What stored runs depend on: how large a race is, and the version of the numbers."""
 
     pixel_step: int
     """Edge of the squares of pixels that are fitted."""
@@ -93,6 +94,8 @@ class Settings(Record):
     """Most paths per pixel of each of the two renders that compare an iterate's images."""
     floor_samples: int
     """Paths per pixel of each Jacobian of the photographs' floor."""
+    numerics: int = NUMERICS
+    """Version of this project's numbers, so that no run goes on under another one."""
 
 
 class FloorRecord(Record):
@@ -117,7 +120,9 @@ class RaceState:
         self.folder.mkdir(parents=True, exist_ok=True)
         file = self.folder / "settings.json"
         if file.is_file() and read_record(file, Settings) != settings:
-            raise InputError(f"{self.folder} holds the state of another race; delete it, or name another --json file.")
+            raise InputError(
+                f"{self.folder} holds the state of another race or version; delete it, or name another --json file."
+            )
         write_record(file, settings)
 
     def stored(self, fresh: Run) -> Run:
