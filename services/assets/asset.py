@@ -128,6 +128,10 @@ def write_asset(
         }
 
     first, scenes, rough = lights[0], dict[str, SceneDict](), report.surface
+    facets: dict[str, Any] = {
+        "roughness": DEFAULT_ROUGHNESS if rough is None else rough.roughness.value,
+        "compensated": rough is not None and rough.multiple_scattering,
+    }
     shown = tuple(with_square_pixels(camera) for camera in cameras)
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
     for index, channel in enumerate(channels):
@@ -136,15 +140,15 @@ def write_asset(
         if report.teeth:
             numbers, mouth = tuple(tooth.fdi for tooth in teeth), mouth_of(report, channel)
             scene = mouth_scene(
-                surfaces, numbers, mouth, shown, position, intensity, boundary=boundary, ior=ior, samples=samples
-            )
+                surfaces, numbers, mouth, shown, position, intensity, boundary=boundary, ior=ior, samples=samples,
+                **facets,
+            )  # fmt: skip
         else:
             tissue = tissue_of(report.parameters[channel])
             stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
             scene = nested_scene(
                 files, tissue, shown, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained,
-                roughness=DEFAULT_ROUGHNESS if rough is None else rough.roughness.value,
-                compensated=rough is not None and rough.multiple_scattering,
+                **facets,
             )  # fmt: skip
         scenes[channel] = scene | _large_cameras(shown, samples) | {"integrator": shell_integrator()}
         write_scene(folder / f"scene_{channel}.xml", scenes[channel])

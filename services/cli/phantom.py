@@ -119,8 +119,6 @@ def phantom(
     face = {name: value for name, value in face.items() if value is not None}
     for name in face:
         option = "--" + name.replace("_", "-")
-        if jaw:
-            raise InputError(f"Option {option} is for one tooth or an object; leave out either it or --jaw.")
         if name != "ior" and boundary is not BoundaryName.ROUGH:
             raise InputError(f"Option {option} is for a rough boundary; add --boundary rough.")
     rig: dict[str, Any] = {

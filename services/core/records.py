@@ -26,7 +26,7 @@ from services.core.light.safety import (
 )
 from services.core.pages.object_words import PARTS
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
-from services.core.surface.rough import FIT, MultipleScattering, Roughness, require_rough_alone
+from services.core.surface.rough import FIT, MultipleScattering, Roughness, require_rough_job
 from services.core.values import AUTO, Number, PixelStep, Positive, Unit, Whole
 
 JobName = Annotated[
@@ -376,7 +376,7 @@ class JobSpec(Record):
     def _particles_and_surface(self) -> JobSpec:
         require_particles(self.dictionary, self.particle_index, self.particle_absorption)
         if self.boundary == "rough":
-            require_rough_alone(self.kind, self.ior, surroundings=self.surroundings, stains=self.stains)
+            require_rough_job(self.kind, self.ior, self.roughness, stains=self.stains)
         return self
 
     @model_validator(mode="after")

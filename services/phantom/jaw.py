@@ -16,10 +16,11 @@ from services.anatomy.scans.scan import read_scan
 from services.anatomy.scans.scanned_jaw import jaw_from_scan
 from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.jaw import build_jaw
-from services.core.errors import InputError, MeshError
+from services.core.errors import MeshError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.records import Boundary
+from services.core.surface.rough import DEFAULT_ROUGHNESS
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import (
     CHANNELS,
@@ -33,7 +34,7 @@ from services.phantom.files import (
 from services.phantom.jaw_optics import GUMS_IOR, jaw_mouth
 from services.phantom.lips import joined, lips_and_retractor
 from services.phantom.render import Stack, render_engine, render_mitsuba
-from services.phantom.surface import IOR, PhantomSurface
+from services.phantom.surface import INK, IOR, PhantomSurface
 from services.transport.optics.parameters import Mouth
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
@@ -64,8 +65,8 @@ class JawSurfaces:
         parts = [mesh for mesh in (self.cavity, self.lips) if mesh is not None]
         return joined(parts) if parts else None
 
-    def recipe(self, lights: tuple[Light, ...], channel: int, boundary: Boundary) -> SceneRecipe:
-        """Scene of one channel for the project's engine, with fixed dentin."""
+    def recipe(self, lights: tuple[Light, ...], channel: int, face: PhantomSurface) -> SceneRecipe:
+        """Scene of one channel for the project's engine, with fixed dentin; gums have the teeth's roughness."""
         surfaces = [
             ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape.known(tooth.dentin))
             for tooth in self.teeth
@@ -78,8 +79,10 @@ class JawSurfaces:
             tuple(surfaces),
             positions,
             intensities,
-            boundary,
-            IOR,
+            face.boundary,
+            face.ior,
+            roughness=face.roughness,
+            multiple_scattering=face.multiple_scattering,
             gums=self.gums,
             gums_ior=GUMS_IOR,
             cavity=self.opaque,
@@ -133,6 +136,9 @@ def write_jaw_phantom(
     held_out: int | None = None,
     channels: int = 1,
     boundary: Boundary = "matched",
+    ior: float = IOR,
+    roughness: float = DEFAULT_ROUGHNESS,
+    multiple_scattering: bool = True,
     seed: int = 1,
     samples: int = 1024,
     renderer: Renderer = "engine",
@@ -149,7 +155,9 @@ def write_jaw_phantom(
         cameras, lights: numbers of cameras and lights.
         held_out: number of lights that are marked as held out; default every fourth.
         channels: 1 (green) or 3 (red, green, blue).
-        boundary: model of the teeth's outer boundary.
+        boundary: model of the outer boundary of teeth and gums.
+        ior, roughness, multiple_scattering: of the teeth's surface, see ``PhantomSurface``; gums have the same
+            roughness, and an index of their own.
         seed: seed of the rendering and of the lights' brightness.
         samples: paths per pixel.
         renderer: the project's engine, or stock Mitsuba for boundary ``matched`` and teeth that do not overlap.
@@ -160,9 +168,8 @@ def write_jaw_phantom(
         InputError: the combination of options is impossible. CaptureInputError: the scan cannot be read. MeshError: a
             surface cannot bound a medium.
     """
-    if boundary == "rough":
-        raise InputError("A jaw has no rough surface yet; choose boundary thin, or leave out --jaw.")
-    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, PhantomSurface(boundary), renderer)
+    face = PhantomSurface(boundary, ior, roughness, multiple_scattering)
+    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, face, renderer)
     jaw, names = jaw_surfaces(subject, scan), CHANNELS[channels]
     if lips:
         jaw = replace(jaw, lips=lips_and_retractor([tooth.outer for tooth in jaw.teeth]))
@@ -176,9 +183,9 @@ def write_jaw_phantom(
     entries, held_out_indices = [], held_out_lights(lights, held_out)
     with TemporaryDirectory() as folder:
         painters = (
-            _by_mitsuba(jaw, mouths, rig_lights, Path(folder))
+            _by_mitsuba(jaw, mouths, rig_lights, face, Path(folder))
             if renderer == "mitsuba"
-            else _by_engine(jaw, mouths, rig_lights, boundary)
+            else _by_engine(jaw, mouths, rig_lights, face)
         )
         for number, camera in enumerate(rig_cameras):
             stacks = [paint(camera, samples, seed + 7919 * number) for paint in painters]
@@ -191,7 +198,7 @@ def write_jaw_phantom(
         "samples_per_pixel": samples,
         "seed": seed,
     }
-    write_description(out, names, rig_cameras, rig_lights, entries, jaw_truth(jaw, mouths, boundary) | settings)
+    write_description(out, names, rig_cameras, rig_lights, entries, jaw_truth(jaw, mouths, face) | settings)
 
 
 def write_jaw_meshes(out: Path, jaw: JawSurfaces) -> None:
@@ -206,12 +213,11 @@ def write_jaw_meshes(out: Path, jaw: JawSurfaces) -> None:
         write_mesh(out / "cavity.ply", jaw.cavity)
 
 
-def jaw_truth(jaw: JawSurfaces, mouths: dict[str, Mouth], boundary: Boundary) -> dict[str, Any]:
+def jaw_truth(jaw: JawSurfaces, mouths: dict[str, Mouth], face: PhantomSurface) -> dict[str, Any]:
     """True optics for ``truth.json``, by channel and FDI number."""
     return {
-        "boundary": boundary,
-        "ior": IOR if boundary == "thin" else 1.0,
-        "gums_ior": GUMS_IOR if boundary == "thin" else 1.0,
+        **face.truth(),
+        "gums_ior": 1.0 if face.boundary == "matched" else GUMS_IOR,
         "channels": {name: _channel_truth(jaw, mouth) for name, mouth in mouths.items()},
         "dentin_shape": jaw.weights and {str(fdi): list(weights) for fdi, weights in jaw.weights.items()},
     }
@@ -234,12 +240,12 @@ def known_mouth(jaw: JawSurfaces, channel: str, subject: int | None) -> Mouth:
 
 
 def _by_engine(
-    jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], boundary: Boundary
+    jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], face: PhantomSurface
 ) -> list[Painter]:
     from services.transport.engine import Engine
 
     def painter(channel: int, mouth: Mouth) -> Painter:
-        engine = Engine(jaw.recipe(lights, channel, boundary))
+        engine = Engine(jaw.recipe(lights, channel, face))
         return lambda camera, samples, seed: render_engine(
             engine, mouth, camera, np.ones(camera.size[::-1], dtype=bool), samples, seed
         )
@@ -247,17 +253,27 @@ def _by_engine(
     return [painter(channel, mouth) for channel, mouth in enumerate(mouths.values())]
 
 
-def _by_mitsuba(jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], folder: Path) -> list[Painter]:
+def _by_mitsuba(
+    jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], face: PhantomSurface, folder: Path
+) -> list[Painter]:
     from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
 
     prepare_device()
     files, fdi = write_mouth_surfaces(folder, jaw.teeth, jaw.gums, jaw.opaque), tuple(tooth.fdi for tooth in jaw.teeth)
 
     def painter(channel: int, mouth: Mouth) -> Painter:
+        # What black teeth, gums and wall show is the highlights.
+        ink = Mouth((INK,) * len(fdi), INK.enamel, None if mouth.reflectance is None else 0.0)
+
         def paint(camera: Camera, samples: int, seed: int) -> Stack:
-            return render_mitsuba(
-                mouth_scene(files, fdi, mouth, (camera,), lights[0].position_mm, 1.0), lights, channel, samples, seed
-            )
+            scene, dark = (
+                mouth_scene(
+                    files, fdi, shown, (camera,), lights[0].position_mm, 1.0, boundary=face.boundary, ior=face.ior,
+                    gums_ior=GUMS_IOR, roughness=face.roughness,
+                )
+                for shown in (mouth, ink)
+            )  # fmt: skip
+            return render_mitsuba(scene, lights, channel, samples, seed, dark if face.is_rough else None)
 
         return paint
 

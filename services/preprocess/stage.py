@@ -66,11 +66,6 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     subject = read_subject(
         source.root, spec.kind == "jaw", spec.fdi, spec.surroundings, is_object=spec.kind == "object"
     )
-    if spec.boundary == "rough" and subject.surroundings:
-        raise SettingsError(
-            "boundary = rough is made for a tooth without surroundings, and this capture's registered scan has some;"
-            " set surroundings to off, or choose boundary = thin."
-        )
     require_plausible_scale(cameras, source.description.lights, subject.teeth)
     if subject.note is not None:
         context.report(StageEvent(stage="prepare", kind="log", message=subject.note))

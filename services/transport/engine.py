@@ -77,7 +77,7 @@ class Engine:
             require_rough(recipe)
         self._boundary = mesh_boundary(
             recipe.boundary, recipe.ior, refracts=refracts, roughness=recipe.roughness,
-            compensated=recipe.multiple_scattering,
+            gums_ior=None if recipe.gums is None else recipe.gums_ior, compensated=recipe.multiple_scattering,
         )  # fmt: skip
         if self._boundary.bends:
             kind = LitFaces

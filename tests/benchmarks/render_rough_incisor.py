@@ -22,7 +22,7 @@ from services.assets.mitsuba.scene import load_scene, nested_scene
 from services.core.geometry import Camera, Light, teeth_folder
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.phantom.tooth import INK
+from services.phantom.surface import INK
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.platform import prepare_device
 

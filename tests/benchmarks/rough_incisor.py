@@ -35,6 +35,7 @@ from services.fit.measurements.observations import read_observations
 from services.fit.measurements.surface import held_surface
 from services.fit.stage import run
 from services.phantom.files import medium_truth
+from services.phantom.render import variance_of_neighbours
 from services.preprocess.stage import run as prepare
 from services.transport.platform import prepare_device
 from tests.benchmarks.render_rough_incisor import (
@@ -65,10 +66,11 @@ def write_capture(target: Path, mean: Images, variance: Images, seed: int) -> No
 
     Args:
         target: folder of the new capture.
-        mean, variance: the true images, and the variance by which they are uncertain themselves.
+        mean, variance: the true images, and the variance by which they are uncertain themselves, which is taken from
+            each pixel's neighbours (``variance_of_neighbours``).
         seed: of the sensor's noise and of the scan's error.
     """
-    random = np.random.default_rng([66, seed])
+    random, variance = np.random.default_rng([66, seed]), variance_of_neighbours(variance)
     description = json.loads((SOURCE / "capture.json").read_text())
     cameras, lights = ([one["name"] for one in description[key]] for key in ("cameras", "lights"))
     target.mkdir(parents=True, exist_ok=True)

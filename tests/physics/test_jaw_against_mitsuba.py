@@ -16,6 +16,7 @@ from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surface
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.jaw import JawSurfaces, jaw_surfaces, known_mouth
 from services.phantom.render import render_engine, render_mitsuba
+from services.phantom.surface import PhantomSurface
 from services.transport.engine import Engine
 from services.transport.platform import prepare_device
 from tests.support.pictures import pixel_scores, require_same_pictures
@@ -39,7 +40,7 @@ def scores(jaw: JawSurfaces, folder: Path, *, pixel_mm: float, samples: int, blo
         mouth_scene(files, fdi, mouth, (camera,), lights[0].position_mm, 1.0), lights, 0, samples, seed=5
     )
     everything = np.ones(camera.size[::-1], dtype=bool)
-    ours = render_engine(Engine(jaw.recipe(lights, 0, "matched")), mouth, camera, everything, samples, seed=6)
+    ours = render_engine(Engine(jaw.recipe(lights, 0, PhantomSurface())), mouth, camera, everything, samples, seed=6)
     return pixel_scores([ours[0], stock[0]], [ours[1], stock[1]], block)
 
 

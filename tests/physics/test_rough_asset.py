@@ -11,7 +11,7 @@ import pytest
 from services.assets.mitsuba.rough_surface import mean_albedos, rough_surface
 from services.assets.mitsuba.scene import load_scene, nested_scene, render_batches
 from services.core.files.meshes import write_mesh
-from services.phantom.tooth import INK
+from services.phantom.surface import INK
 from services.transport.engine import Engine
 from services.transport.platform import prepare_device
 from tests.support.rough_truths import LIGHTS, TISSUE, scene_recipe, view

@@ -15,9 +15,9 @@ from services.transport.optics.ggx_albedo import ANGLES, albedo_tables
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe_files import read_recipe, write_recipe
+from tests.support.furnace import escaping_weights
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.rough_truths import CASES, NARROW_CASE, STORED, TISSUE, RoughTruth, ball, incisor, scene_recipe, view
-from tests.support.small_mouth import mouth_recipe
 from tests.support.small_tooth import camera_at, whole_view
 from tests.support.z_scores import student_to_normal
 
@@ -159,11 +159,6 @@ def test_what_is_no_rough_surface_is_refused(changed: dict[str, float], sentence
         Engine(replace(scene_recipe(0.15, 1.63), **changed))  # type: ignore[arg-type]
 
 
-def test_a_rough_mouth_is_refused() -> None:
-    with pytest.raises(InputError, match="boundary = rough is made for one tooth"):
-        Engine(replace(mouth_recipe("thin"), boundary="rough"))
-
-
 def test_gradients_that_need_straight_light_are_refused() -> None:
     engine = Engine(scene_recipe(0.15, 1.63))
     with pytest.raises(InputError, match="boundary = rough has not the gradient to stains"):
@@ -173,37 +168,9 @@ def test_gradients_that_need_straight_light_are_refused() -> None:
 
 
 def test_white_walks_carry_all_their_weight_out_of_a_closed_surface() -> None:
-    prepare_device()
-    import mitsuba as mi
-
-    from services.transport.boundary.models import mesh_boundary
-    from services.transport.paths.rows import Rows
-    from services.transport.paths.scores import Plan
-    from services.transport.paths.starts import CameraStart
-    from services.transport.paths.tally import Tally
-    from services.transport.paths.walk import Walk
-    from services.transport.paths.walker import Flight, Walker
-    from services.transport.scene.media import Media
-    from services.transport.scene.mesh_geometry import MeshGeometry
-
-    class Furnace(Walk):
-        """Walks that count their weight where they leave for good: a furnace as seen by the camera."""
-
-        def _step(self, walker: Walker, tally: Tally, rows: Rows) -> Walker:
-            self.tally = tally
-            return super()._step(walker, tally, rows)
-
-        def _end(self, walker: Walker, flight: Flight) -> mi.Bool:
-            gone = walker.active & ~flight.scatters & ~flight.meets
-            self.tally.add(walker.row, mi.UInt32(0), self._throughput(walker), gone)
-            return super()._end(walker, flight)
-
-    white = Media([Medium(1.0, 1.0, g1=0.5)])
-    geometry = MeshGeometry(scene_recipe(0.15, 1.63))
-    start = CameraStart(whole_view(camera_at((0.2, 1, 0.1), size=16, span_mm=2.0)), 4, seed=7, radius_mm=2.0)
-    boundary = mesh_boundary("rough", 1.63, roughness=0.15)
-    sums, _ = Furnace(geometry, white, None, start, Plan(), boundary).run(256).arrays()
-    lanes = sums[:, 0] / 256
+    recipe = replace(scene_recipe(0.15, 1.63), multiple_scattering=True)
+    start = whole_view(camera_at((0.2, 1, 0.1), size=16, span_mm=2.0))
+    lanes = escaping_weights(recipe, [Medium(1.0, 1.0, g1=0.5)], start)
     error = lanes.std(ddof=1) / np.sqrt(len(lanes))
     assert error <= 1e-3
     # Without compensation it is 0.85.

@@ -18,6 +18,7 @@ from services.core.geometry import Camera, Light
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import held_out_lights, write_description, write_images
 from services.phantom.jaw import JawSurfaces, jaw_surfaces, jaw_truth, known_mouth, write_jaw_meshes
+from services.phantom.surface import PhantomSurface
 from services.transport.optics.parameters import Mouth
 
 STORED = Path(__file__).resolve().parents[1] / "data" / "truths-jaw" / "subject-1.npz"
@@ -95,7 +96,7 @@ def by_engine(truth: JawTruth, samples: int) -> JawTruth:
     from services.phantom.render import render_engine
     from services.transport.engine import Engine
 
-    engine = Engine(truth.jaw.recipe(truth.lights, 0, "matched"))
+    engine = Engine(truth.jaw.recipe(truth.lights, 0, PhantomSurface()))
     whole = [(9001 + k, camera, np.ones(camera.size[::-1], dtype=bool)) for k, camera in enumerate(truth.cameras)]
     stacks = [render_engine(engine, truth.mouth, camera, seen, samples, seed) for seed, camera, seen in whole]
     return replace(truth, mean=tuple(mean for mean, _ in stacks), variance=tuple(variance for _, variance in stacks))
@@ -127,7 +128,7 @@ def write_jaw_capture(folder: Path, truth: JawTruth, seed: int, *, dentin: bool 
         )
     )
     write_jaw_meshes(folder, jaw)
-    known = jaw_truth(truth.jaw, {CHANNEL: truth.mouth}, "matched")
+    known = jaw_truth(truth.jaw, {CHANNEL: truth.mouth}, PhantomSurface())
     write_description(
         folder, (CHANNEL,), truth.cameras, truth.lights, entries, known | {"subject": SUBJECT, "renderer": "mitsuba"}
     )

@@ -1,8 +1,10 @@
 """Images of rough dielectric surfaces by stock Mitsuba, stored because they take minutes;
-``python -m tests.support.rough_truths`` renders them anew: three balls, and the micro-CT incisor where it is shared.
+``python -m tests.support.rough_truths`` renders them anew: three balls, a mouth, and the micro-CT incisor where it is
+shared.
 
 Each image is ``prbvolpath``'s, less the image of the same surface around black ink: what is left has come out of the
-object, as an engine without highlights shows it.
+object, as an engine without highlights shows it. In the mouth it is what the media add to the light of the wall, also
+by reflection in other faces.
 """
 
 from __future__ import annotations
@@ -23,11 +25,13 @@ from services.core.geometry import Camera
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from services.transport.boundary.rough import Rough
-from services.transport.optics.parameters import Medium, Tissue
+from services.transport.optics.parameters import Medium, Mouth, Tissue
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe import SceneRecipe, View, single_tooth
 from tests.support.pictures import BATCHES
 from tests.support.shared_data import shared_path
+from tests.support.small_mouth import LIGHTS_MM as MOUTH_LIGHTS_MM
+from tests.support.small_mouth import MOUTH, mouth_recipe, stock_mouth
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, camera_at, sphere, whole_view
 
 STORED = Path(__file__).parents[1] / "data" / "rough_truths.npz"
@@ -39,10 +43,14 @@ CASES = ((0.15, 1.63), (0.3, 1.33))
 NARROW_CASE = (0.05, 1.63)
 """The same of a ball whose images have rare bright paths in stock Mitsuba, so that they take many more."""
 INCISOR_CASE = (0.3, 1.63)
+MOUTH_ROUGHNESS = 0.3
+MOUTH_INK = Mouth((INK, INK), INK.enamel, MOUTH.reflectance)
+"""A mouth of black teeth and gums before the same wall."""
 LIGHTS = LIGHTS_MM[[1, 3]]
 SAMPLES = 4096
 NARROW_SAMPLES = 65_536
 INCISOR_SAMPLES = 49_152
+MOUTH_SAMPLES = 65_536
 COARSER = 4
 """Pixels of the incisor's view in one pixel here, along each edge: 0.5 mm become 2 mm."""
 
@@ -98,6 +106,34 @@ def incisor() -> RoughTruth:
     return RoughTruth("incisor", recipe, INCISOR_TISSUE, whole_view(camera), INCISOR_SAMPLES)
 
 
+def rough_mouth() -> tuple[SceneRecipe, View]:
+    """The small mouth with a rough surface, 16 x 16 pixels."""
+    recipe = replace(mouth_recipe("rough"), roughness=MOUTH_ROUGHNESS, multiple_scattering=False)
+    return recipe, whole_view(camera_at((0.3, 1, 0.25), size=16, span_mm=13))
+
+
+def mouth_images() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and variance of the mean, (lights, H, W) each, of the mouth's light less that of black teeth and gums."""
+    prepare_device()
+    _, view = rough_mouth()
+    found = []
+    for number in range(len(MOUTH_LIGHTS_MM)):
+        parts = []
+        for mouth in (MOUTH, MOUTH_INK):
+            with tempfile.TemporaryDirectory() as folder:
+                scene = load_scene(
+                    stock_mouth(
+                        Path(folder), view.camera, number, "rough", MOUTH_SAMPLES, mouth=mouth,
+                        roughness=MOUTH_ROUGHNESS,
+                    )
+                )  # fmt: skip
+            parts.append(render_batches(scene, 0, MOUTH_SAMPLES, 51 + number, BATCHES))
+        (whole, noise), (black, black_noise) = parts
+        found.append((whole - black, noise + black_noise))
+    mean, variance = (np.stack(arrays) for arrays in zip(*found, strict=True))
+    return mean, variance
+
+
 def images(truth: RoughTruth) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean and variance of the mean, (lights, H, W) each, of the light that has come out."""
     prepare_device()
@@ -126,10 +162,16 @@ def images(truth: RoughTruth) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     return mean, variance
 
 
+def main() -> None:
+    """Render the scenes that are named, or all."""
+    truths = {truth.name: truth for truth in (ball(*case) for case in (*CASES, NARROW_CASE))}
+    stored = dict(np.load(STORED)) if STORED.is_file() else {}
+    for name in sys.argv[1:] or [*truths, "mouth", "incisor"]:
+        mean, variance = mouth_images() if name == "mouth" else images(truths[name] if name in truths else incisor())
+        stored |= {f"mean/{name}": mean.astype(np.float32), f"variance/{name}": variance.astype(np.float32)}
+        sys.stderr.write(f"{name}: {np.sqrt(variance.sum()) / mean.sum():.2%}\n")
+        np.savez(STORED, **stored)
+
+
 if __name__ == "__main__":
-    arrays: dict[str, Any] = {}
-    for truth in (*(ball(*case) for case in (*CASES, NARROW_CASE)), incisor()):
-        mean, variance = images(truth)
-        arrays |= {f"mean/{truth.name}": mean.astype(np.float32), f"variance/{truth.name}": variance.astype(np.float32)}
-        sys.stderr.write(f"{truth.name}: {np.sqrt(variance.sum()) / mean.sum():.2%}\n")
-    np.savez(STORED, **arrays)
+    main()

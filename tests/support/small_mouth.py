@@ -18,6 +18,7 @@ from services.assets.mitsuba.scene import boundary_dict, medium_dict, sensor_dic
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
 from services.core.records import Boundary
+from services.core.surface.rough import DEFAULT_ROUGHNESS
 from services.transport.optics.parameters import Medium, Mouth, Tissue
 from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
 from tests.support.small_tooth import INTENSITY
@@ -110,7 +111,16 @@ def mouth_recipe(boundary: Boundary) -> SceneRecipe:
     )
 
 
-def stock_mouth(folder: Path, camera: Camera, light: int, boundary: Boundary, samples: int) -> dict[str, Any]:
+def stock_mouth(
+    folder: Path,
+    camera: Camera,
+    light: int,
+    boundary: Boundary,
+    samples: int,
+    *,
+    mouth: Mouth = MOUTH,
+    roughness: float = DEFAULT_ROUGHNESS,
+) -> dict[str, Any]:
     """The same scene for stock Mitsuba, made of surfaces that do not overlap."""
     height = ROOTED.vertices_mm[ROOTED.faces].mean(axis=1)[:, 2]
     parts = {
@@ -120,15 +130,15 @@ def stock_mouth(folder: Path, camera: Camera, light: int, boundary: Boundary, sa
     parts |= {"core": CORE, "free": FREE, "gums": gums(2.0), "wall": wall()}
     for name, mesh in parts.items():
         write_mesh(folder / f"{name}.ply", mesh)
-    rooted, free = MOUTH.teeth
-    assert MOUTH.gums is not None
-    media = {"enamel": rooted.enamel, "dentin": rooted.dentin, "other": free.enamel, "flesh": MOUTH.gums}
+    rooted, free = mouth.teeth
+    assert mouth.gums is not None
+    media = {"enamel": rooted.enamel, "dentin": rooted.dentin, "other": free.enamel, "flesh": mouth.gums}
 
     def surface(name: str, ior: float, inside: str, outside: str | None = None) -> dict[str, Any]:
         sides = {"interior": {"type": "ref", "id": f"medium_{inside}"}} | (
             {"exterior": {"type": "ref", "id": f"medium_{outside}"}} if outside else {}
         )
-        bsdf = {"type": "null"} if ior == 1 else boundary_dict(boundary, ior)
+        bsdf = {"type": "null"} if ior == 1 else boundary_dict(boundary, ior, roughness=roughness)
         return {
             "type": "ply",
             "filename": (folder / f"{name}.ply").as_posix(),
@@ -156,7 +166,7 @@ def stock_mouth(folder: Path, camera: Camera, light: int, boundary: Boundary, sa
                 "face_normals": True,
                 "bsdf": {
                     "type": "twosided",
-                    "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": MOUTH.reflectance}},
+                    "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": mouth.reflectance}},
                 },
             },
         }

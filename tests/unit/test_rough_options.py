@@ -6,27 +6,20 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from services.cli.app import build_app
-from services.core.errors import InputError, SettingsError
-from services.core.files.meshes import write_mesh
-from services.core.geometry import Mesh
-from services.core.raw.registration import REGISTRATION
+from services.core.errors import InputError
 from services.core.records import JobSpec
-from services.core.stage import LocalContext
 from services.fit.measurements.observations import channel_scene, read_observations
 from services.fit.measurements.surface import held_surface
 from services.phantom.jaw import write_jaw_phantom
 from services.phantom.object import write_object_phantom
 from services.phantom.surface import PhantomSurface
 from services.phantom.tooth import write_phantom
-from services.preprocess.stage import run
-from tests.support.folder_captures import write_folder
-from tests.support.prepared import sphere, write_prepared
+from tests.support.prepared import write_prepared
 
 
 def job(**options: Any) -> JobSpec:
@@ -48,9 +41,8 @@ def test_a_job_that_gives_nothing_has_a_compensated_surface() -> None:
         ({"roughness": True}, "the GGX roughness of the surface"),
         ({"ior": 1.0}, "ior = 1 is too close to that of air for boundary = rough, which needs at least 1.01"),
         ({"ior": 0.9}, "greater than or equal to 1"),
-        ({"kind": "jaw"}, "not for a jaw; choose boundary = thin"),
+        ({"kind": "jaw"}, "the roughness of a jaw is not measured; give roughness = 0.15"),
         ({"stains": True}, "has no stains; leave out stains, or choose boundary = thin"),
-        ({"surroundings": "on"}, "set surroundings to off, or choose boundary = thin"),
         ({"multiple_scattering": True}, "'on' or 'off'"),
     ],
 )
@@ -79,18 +71,6 @@ def test_the_scene_of_a_fit_has_the_jobs_surface(tmp_path: Path) -> None:
     assert held_surface(job(boundary="thin"), observations, tmp_path, print) is None
 
 
-def test_surroundings_of_a_registered_scan_are_refused_before_any_pixel(tmp_path: Path) -> None:
-    capture = tmp_path / "capture"
-    write_folder(capture)
-    (capture / REGISTRATION).write_text("{}")
-    neighbour = sphere(4.0)
-    write_mesh(
-        capture / "teeth" / "21" / "outer.ply", Mesh(neighbour.vertices_mm + np.array([9.0, 0, 0]), neighbour.faces)
-    )
-    with pytest.raises(SettingsError, match="this capture's registered scan has some; set surroundings to off"):
-        run(job(capture=capture, fdi=11), LocalContext(tmp_path / "job"))
-
-
 @pytest.mark.parametrize(
     ("values", "told"),
     [
@@ -107,8 +87,8 @@ def test_phantoms_refuse_what_a_rough_surface_cannot_have(tmp_path: Path) -> Non
     rough: dict[str, Any] = {"boundary": "rough"}
     with pytest.raises(InputError, match="add --multiple-scattering off, or choose renderer engine"):
         write_object_phantom(tmp_path, renderer="mitsuba", **rough)
-    with pytest.raises(InputError, match="A jaw has no rough surface yet; choose boundary thin, or leave out --jaw"):
-        write_jaw_phantom(tmp_path, **rough)
+    with pytest.raises(InputError, match="add --multiple-scattering off, or choose renderer engine"):
+        write_jaw_phantom(tmp_path, renderer="mitsuba", **rough)
     with pytest.raises(InputError, match="A rough surface has no stains; leave them out, or choose boundary thin"):
         write_phantom(tmp_path, stains=True, **rough)
 
@@ -116,7 +96,7 @@ def test_phantoms_refuse_what_a_rough_surface_cannot_have(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("--jaw --ior 1.5", "Option --ior is for one tooth or an object; leave out either it or --jaw."),
+        ("--jaw --roughness 0.3", "Option --roughness is for a rough boundary; add --boundary rough."),
         ("--roughness 0.3", "Option --roughness is for a rough boundary; add --boundary rough."),
         ("--boundary thin --multiple-scattering off", "Option --multiple-scattering is for a rough boundary"),
     ],

@@ -18,6 +18,7 @@ from services.assets.mitsuba.scene import (
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.records import Boundary
+from services.core.surface.rough import DEFAULT_ROUGHNESS
 from services.transport.optics.parameters import Mouth
 
 SurfaceFiles = Mapping[str, Path]
@@ -58,6 +59,8 @@ def mouth_scene(
     ior: float = 1.631,
     gums_ior: float = 1.33,
     samples: Any = 64,
+    roughness: float = DEFAULT_ROUGHNESS,
+    compensated: bool = False,
 ) -> SceneDict:
     """Scene of a mouth under one point light; for the other arguments see ``scene.nested_scene``.
 
@@ -65,6 +68,7 @@ def mouth_scene(
         files: surfaces that ``write_mouth_surfaces`` wrote.
         fdi: FDI numbers in the order of the mouth's teeth.
         gums_ior: refractive index of the gums.
+        roughness, compensated: of a rough surface, see ``rough_surface``.
     """
     scene = lit_scene(light_mm, intensity)
     for number, tissue in zip(fdi, mouth.teeth, strict=True):
@@ -79,7 +83,8 @@ def mouth_scene(
         sides = {"interior": {"type": "ref", "id": f"medium_{inside}"}} | (
             {"exterior": {"type": "ref", "id": f"medium_{outside}"}} if outside else {}
         )
-        return surface_dict(path, {"type": "null"} if contrast == 1 else boundary_dict(boundary, contrast)) | sides
+        face = boundary_dict(boundary, contrast, roughness=roughness, compensated=compensated)
+        return surface_dict(path, {"type": "null"} if contrast == 1 else face) | sides
 
     for name, path in files.items():
         kind, _, suffix = name.partition("_")

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from services.assets.colour.smoothing import smoothed_colours
 from services.assets.mitsuba.rough_surface import rough_surface
 from services.assets.mitsuba.scene import MAX_DEPTH, ROULETTE_DEPTH, medium_dict
-from services.phantom.surface import IOR
-from services.phantom.tooth import INK
+from services.phantom.surface import INK, IOR
 from services.transport.optics.parameters import Medium, Tissue
 
 SceneDict = dict[str, Any]

@@ -57,21 +57,19 @@ MultipleScattering = Annotated[
 """Whether a rough surface is compensated for light that meets several of its facets."""
 
 
-def require_rough_alone(kind: str, ior: float, *, surroundings: str, stains: bool) -> None:
+def require_rough_job(kind: str, ior: float, roughness: float | Literal["fit"], *, stains: bool) -> None:
     """Refuse what a job with a rough surface cannot have.
 
     Raises:
         ValueError: names the option and the remedy.
     """
-    if kind == "jaw":
-        raise ValueError("boundary = rough is made for a single tooth or object, not for a jaw; choose boundary = thin")
+    if kind == "jaw" and roughness == FIT:
+        raise ValueError(
+            "the roughness of a jaw is not measured; give roughness = 0.15, or what a fit of one of its teeth measures,"
+            " or choose boundary = thin"
+        )
     if stains:
         raise ValueError("boundary = rough has no stains; leave out stains, or choose boundary = thin")
-    if surroundings == "on":
-        raise ValueError(
-            "boundary = rough is made for a tooth without surroundings; set surroundings to off, or choose boundary ="
-            " thin"
-        )
     if ior < MIN_ROUGH_IOR:
         raise ValueError(
             f"ior = {ior:g} is too close to that of air for boundary = rough, which needs at least {MIN_ROUGH_IOR:g};"

@@ -123,5 +123,7 @@ def weighed(domain: Domain, equations: NormalEquations) -> Domain:
     by_rendering, by_photographs = (
         np.diag(noise)[domain.tissue_count :] for noise in (equations.gradient_noise, equations.data_noise)
     )
-    ratio = float(np.median(by_rendering / np.maximum(by_photographs, 1e-300)))
+    # An error that changes no photograph has no noise to compare.
+    told = by_photographs > 0
+    ratio = float(np.median(by_rendering[told] / by_photographs[told])) if told.any() else 0.0
     return replace(domain, errors=replace(domain.errors, weight=1 + max(ratio, 0.0)))

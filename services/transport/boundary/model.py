@@ -86,9 +86,14 @@ class BendingBoundary(Boundary, Protocol):
     def aims(self, lights: int) -> bool:
         """Whether images under so many lights cost less with connections that are aimed from scattering vertices."""
 
-    def towards(self, omega: mi.Vector3f, normal: mi.Vector3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """What a walk along ``omega`` that meets a face receives from a light in
-        ``direction`` outside, over the light's irradiance, 1/sr; and the derivative of its logarithm to the roughness.
+    def towards(
+        self, omega: mi.Vector3f, normal: mi.Vector3f, direction: mi.Vector3f, ior: mi.Float | None = None
+    ) -> tuple[mi.Float, mi.Float]:
+        """What a walk along ``omega`` that meets a face receives from a light in ``direction`` outside, over the
+        light's irradiance, 1/sr; and the derivative of its logarithm to the roughness.
+
+        Args:
+            ior: index of refraction of the solid behind the face; None for that of the teeth.
         """
 
 

@@ -18,7 +18,13 @@ SLAB_MODELS: dict[str, Any] = {"matched": Matched, "thin": Thin, "smooth": Smoot
 
 
 def mesh_boundary(
-    name: str, ior: float, *, refracts: bool = True, roughness: float = 0.15, compensated: bool = True
+    name: str,
+    ior: float,
+    *,
+    refracts: bool = True,
+    roughness: float = 0.15,
+    gums_ior: float | None = None,
+    compensated: bool = True,
 ) -> Boundary:
     """The boundary of a scene of meshes; without any contrast of indices every model is the matched one.
 
@@ -27,13 +33,14 @@ def mesh_boundary(
         ior: index of refraction of the teeth.
         refracts: whether there is any contrast of indices in the scene.
         roughness: GGX roughness of a rough surface.
+        gums_ior: index of refraction of gums behind a rough surface; None for a scene without gums.
         compensated: whether a rough surface gives back light that meets several facets.
 
     Raises:
         SettingsError: there is no model of that name.
     """
     if name == Rough.name and refracts:
-        return Rough(ior, roughness, compensated=compensated)
+        return Rough(ior, roughness, gums_ior=gums_ior, compensated=compensated)
     return _model(MESH_MODELS, name, ior, refracts=refracts)  # type: ignore[no-any-return]
 
 

@@ -65,7 +65,10 @@ class LitFaces:
             dr.eval(blocked)
             dr.sync_thread()
             seen = (~np.array(blocked)).reshape(-1, 4).sum(axis=1)
-            rows.append(np.where(seen == 4, LIT, np.where(seen == 0, DARK, MIXED)))
+            kinds = np.where(seen == 4, LIT, np.where(seen == 0, DARK, MIXED))
+            # The wall of a mouth is open and seen from both sides.
+            kinds[geometry.wall_faces] = MIXED
+            rows.append(kinds)
         self._table = mi.UInt32(np.concatenate(rows).astype(np.uint32))
         dr.eval(self._table)
 

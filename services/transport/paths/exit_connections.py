@@ -3,6 +3,7 @@
 No vertex inside sees a light straight on. A walk that meets the face receives light by the face's own lobe, which is
 wide for a rough face. Whether a light reaches the face is known for most triangles before (``LitFaces``).
 
+In a mouth only faces to air count, not those between a root and the gums, and a wall scatters as a white surface does.
 Where connections are aimed from scattering vertices too (``aimed_connections``), a walk that flew from a vertex to the
 face in one leg counts by the balance heuristic, and one that comes from another part of the face in full.
 """
@@ -22,7 +23,7 @@ from services.transport.paths.connections import Connections
 from services.transport.paths.scores import Plan, Scores
 from services.transport.paths.vertex import Aim, Facing, Leg, Vertex
 from services.transport.paths.walker import Flight, Walker
-from services.transport.scene.geometry import Geometry
+from services.transport.scene.geometry import Geometry, facing
 from services.transport.scene.media import Media, PhaseFunction
 from services.transport.scene.mesh_geometry import MeshGeometry
 
@@ -47,26 +48,43 @@ class ExitConnections(Connections):
         assert isinstance(boundary, BendingBoundary)
         self.faces = boundary
         # An aimed connection to a border that moves is not differentiated.
-        self.aims = plan.shape is None and isinstance(geometry, MeshGeometry) and boundary.aims(lights.count)
+        self.aims = (
+            plan.shape is None
+            and isinstance(geometry, MeshGeometry)
+            and geometry.single
+            and boundary.aims(lights.count)
+        )
         self.period = STEPS_BESIDE_AIMED if self.aims else STEPS_PER_CONNECTION
 
     def found(self, walker: Walker, flight: Flight, throughput: mi.Float) -> tuple[Vertex, mi.Bool]:
-        """The vertex of walks that have met a face, just outside it, with the throughput before the face."""
-        (arrival,), hit = flight.arrival, flight.hit
-        throughput = arrival.throughput
-        leaving = dr.dot(arrival.omega, hit.normal) > 0
-        if self.geometry.stained:
-            throughput = throughput * self.geometry.stain(hit, arrival.connects & leaving)
+        """The vertex of walks that have met a face, just outside it, with the throughput before the face; and of those
+        that a wall scatters.
+        """
+        (arrival,), hit, geometry = flight.arrival, flight.hit, self.geometry
+        leaving, connects = dr.dot(arrival.omega, hit.normal) > 0, arrival.connects
+        omega, before, wall, ior = arrival.omega, arrival.throughput, [], []
+        inside = flight.reflects == leaving
+        if not geometry.single:
+            normal = mi.Vector3f(hit.normal)
+            within, outside = (geometry.beyond(walker.enclosure, towards, hit) for towards in (-normal, normal))
+            connects &= (geometry.medium(outside) == 0) & ~hit.opaque
+            ior = [geometry.index(self.faces.ior, within)]
+        if geometry.stained:
+            before = before * geometry.stain(hit, connects & leaving)
+        if geometry.opaque:
+            wall, inside = [flight.bounces], inside & ~flight.bounces
+            omega = dr.select(flight.bounces, facing(omega, hit), omega)
+            before, connects = dr.select(flight.bounces, throughput, before), connects | flight.bounces
         vertex = Vertex(
-            self.geometry.outside(walker.origin, hit, flight.reflects == leaving), arrival.omega, mi.UInt32(0),
-            throughput, mi.Float(1), walker.scatterings, walker.sums, walker.border_sums, walker.secondary,
-            walker.shape_factor, [], [Facing(mi.Vector3f(hit.normal), hit.primitive, walker.leg, [])], walker.stains,
-            mi.Float(0),
+            geometry.outside(walker.origin, hit, inside), omega, mi.UInt32(0), before, mi.Float(1), walker.scatterings,
+            walker.sums, walker.border_sums, walker.secondary, walker.shape_factor, wall,
+            [Facing(mi.Vector3f(hit.normal), hit.primitive, ior, walker.leg, [])], walker.stains, mi.Float(0),
         )  # fmt: skip
-        return vertex, arrival.connects
+        return vertex, connects
 
     def _no_facing(self) -> list[Facing]:
-        return [Facing(mi.Vector3f(0, 0, 1), mi.UInt32(0), [Leg.none()] * self.aims, [])]
+        ior = [] if self.geometry.single else [mi.Float(1)]
+        return [Facing(mi.Vector3f(0, 0, 1), mi.UInt32(0), ior, [Leg.none()] * self.aims, [])]
 
     def _prepared(self, vertex: Vertex, active: mi.Bool) -> Vertex:
         if not self.aims:
@@ -82,19 +100,26 @@ class ExitConnections(Connections):
         return self.lights.maps.look_up(light, vertex.point, vertex.facing[0].primitive, active)
 
     def _density(self, vertex: Vertex, direction: mi.Vector3f) -> mi.Float:
-        value, _ = self.faces.towards(vertex.omega, vertex.facing[0].normal, direction)
+        value, _ = self._received(vertex, direction)
         for aim in vertex.facing[0].aim:
             value *= 1 - aimed_share(aim, vertex.omega, direction, self.faces.ior)
+        if vertex.wall:
+            value = dr.select(vertex.wall[0], dr.maximum(dr.dot(vertex.omega, direction), 0) * dr.inv_pi, value)
         return value
+
+    def _received(self, vertex: Vertex, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """What the face receives from a light, and the derivative of its logarithm to the roughness."""
+        (facing,) = vertex.facing
+        return self.faces.towards(vertex.omega, facing.normal, direction, *facing.ior)
 
     def _terms(self, vertex: Vertex, direction: mi.Vector3f) -> dict[str, mi.Float]:
         if not any(score.field == "roughness" for score in self.plan.scores):
             return {}
-        _, score = self.faces.towards(vertex.omega, vertex.facing[0].normal, direction)
-        return {"roughness": score}
+        return {"roughness": self._received(vertex, direction)[1]}
 
-    def _medium(self, vertex: Vertex) -> mi.UInt32:  # noqa: ARG002 - the vertex lies in no medium
-        return mi.UInt32(0)
+    def _medium(self, vertex: Vertex) -> mi.UInt32:
+        """None but the wall."""
+        return dr.select(vertex.wall[0], mi.UInt32(self.media.count), mi.UInt32(0)) if vertex.wall else mi.UInt32(0)
 
 
 def aim_of(connections: Connections, point: mi.Point3f, active: mi.Bool) -> Aim:

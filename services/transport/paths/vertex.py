@@ -48,6 +48,8 @@ class Facing:
     """Outward unit normal."""
     primitive: mi.UInt32
     """Number of the triangle."""
+    ior: list[mi.Float]
+    """Index of refraction of the solid behind it; empty where all solids have that of the teeth."""
     leg: list[Leg]
     """The leg on which the path arrived; empty unless connections are aimed too."""
     aim: list[Aim]

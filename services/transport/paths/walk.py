@@ -146,23 +146,18 @@ class Walk:
         meets = walker.active & ~scatters & hit.valid
         # A face lets a camera ray in, weighted, where its mirror image would be of empty space, and reflects other rays
         # by chance.
-        omits = self._omits_reflection(walker, medium)
+        unentered = (self.scores.order(walker.scatterings) == 0) & (medium == 0) & walker.primary
+        omits = unentered if self.geometry.single else mi.Bool(False)
         met = self.boundary.meet(self.geometry, walker.omega, walker.enclosure, hit, meets, omits, walker.rng)
         arrival = []
         if self.boundary.bends:
-            # The highlight, which a camera ray that has not entered sees, is left out.
-            arrival = [Arrival(walker.omega, self._throughput(walker), meets & hit.outer & ~omits)]
+            # The highlight, which a camera ray that has entered nothing sees, is left out.
+            arrival = [Arrival(walker.omega, self._throughput(walker), meets & hit.outer & ~unentered)]
         walker.weight *= met.weight
         return Flight(
             medium, sigma, hit, distance, scatters, meets, met.reflects, meets & hit.opaque, met.onward,
             met.roughness_score, arrival,
         )  # fmt: skip
-
-    def _omits_reflection(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:
-        """Lanes whose reflection at an outer face is left out: camera rays that would mirror empty space."""
-        if not self.geometry.single:
-            return mi.Bool(False)
-        return (self.scores.order(walker.scatterings) == 0) & (medium == 0) & walker.primary
 
     def _fly_past_faces(self, walker: Walker, throughput: mi.Float, tally: Tally) -> Flight:
         medium = self.geometry.medium(walker.enclosure)

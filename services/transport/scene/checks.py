@@ -57,7 +57,7 @@ def require_rough(recipe: SceneRecipe) -> None:
     """Refuse what a ``rough`` boundary cannot be or surround.
 
     Raises:
-        InputError: a roughness out of its range, an index too close to that of air, or more than one tooth.
+        InputError: a roughness out of its range, or an index too close to that of air.
     """
     low, high = ROUGHNESS
     if not low <= recipe.roughness <= high:
@@ -70,10 +70,10 @@ def require_rough(recipe: SceneRecipe) -> None:
             f"ior = {recipe.ior:g} is too close to that of air for a rough surface, which needs at least"
             f" {MIN_ROUGH_IOR:g}; choose boundary = matched."
         )
-    if len(recipe.all_teeth) > 1 or recipe.gums is not None or recipe.cavity is not None:
+    if recipe.gums is not None and recipe.gums_ior < MIN_ROUGH_IOR:
         raise InputError(
-            "boundary = rough is made for one tooth and nothing else; leave out its surroundings, or choose boundary ="
-            " thin."
+            f"gums_ior = {recipe.gums_ior:g} is too close to that of air for a rough surface, which needs at least"
+            f" {MIN_ROUGH_IOR:g}; give that of gums, 1.33."
         )
 
 

@@ -87,6 +87,9 @@ class Geometry(Protocol):
     def contrast(self, ior: mi.Float, before: mi.UInt32, after: mi.UInt32) -> mi.Float:
         """Ratio of the indices of refraction on the two sides of an outer face; ``ior`` is the teeth's."""
 
+    def index(self, ior: mi.Float, enclosure: mi.UInt32) -> mi.Float:
+        """Index of refraction at a place; ``ior`` is the teeth's."""
+
     def stain(self, hit: Hit, active: mi.Bool) -> mi.Float:
         """Transmittance of the stains where an outer face is crossed; called only where ``stained`` is true."""
 
@@ -162,6 +165,10 @@ class SlabGeometry:
     def contrast(self, ior: mi.Float, before: mi.UInt32, after: mi.UInt32) -> mi.Float:  # noqa: ARG002 - meshes need the places
         """``ior`` itself, because all layers have one index of refraction."""
         return ior
+
+    def index(self, ior: mi.Float, enclosure: mi.UInt32) -> mi.Float:
+        """``ior`` within the layers."""
+        return dr.select(self.medium(enclosure) != 0, ior, 1)
 
     def stain(self, hit: Hit, active: mi.Bool) -> mi.Float:  # noqa: ARG002 - faces have none
         """No stains."""

@@ -58,6 +58,7 @@ class MeshGeometry:
         )
         self._fixed_mm = np.concatenate([mesh.vertices_mm for mesh in fixed.values()])
         self.fixed_faces = sum(len(mesh.faces) for mesh in fixed.values())
+        self.wall_faces = slice(self.fixed_faces - (len(recipe.cavity.faces) if recipe.cavity else 0), self.fixed_faces)
         numbers = [*fixed, *(self.teeth + k for k in self._dentins)]
         self._surface = mi.UInt32(np.repeat(numbers, [len(mesh.faces) for mesh in meshes]).astype(np.uint32))
 
@@ -227,13 +228,15 @@ class MeshGeometry:
         """Ratio, at least 1, of the indices of refraction of the media at two places."""
         if self.single:
             return ior
-
-        def index(enclosure: mi.UInt32) -> mi.Float:
-            tooth = self.inside(enclosure)
-            return dr.select(tooth < self.teeth, ior, dr.select(tooth == self.teeth, self.recipe.gums_ior, 1.0))
-
-        first, second = index(before), index(after)
+        first, second = self.index(ior, before), self.index(ior, after)
         return dr.maximum(first, second) / dr.minimum(first, second)
+
+    def index(self, ior: mi.Float, enclosure: mi.UInt32) -> mi.Float:
+        """Index of refraction at a place."""
+        if self.single:
+            return dr.select((enclosure & 1) != 0, ior, 1.0)
+        tooth = self.inside(enclosure)
+        return dr.select(tooth < self.teeth, ior, dr.select(tooth == self.teeth, self.recipe.gums_ior, 1.0))
 
     def advance(self, origin: mi.Point3f, direction: mi.Vector3f, hit: Hit, through: mi.Bool) -> mi.Point3f:
         """The hit point, offset along the normal to either side as Mitsuba does."""

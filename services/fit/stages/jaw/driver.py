@@ -28,6 +28,7 @@ from services.fit.measurements.observations import (
     require_signal,
     write_channel,
 )
+from services.fit.measurements.surface import held_surface
 from services.fit.measurements.view_stack import ViewStack
 from services.fit.stages.attempt import Attempt
 from services.fit.stages.jaw.schedule import JawSchedule
@@ -76,6 +77,7 @@ class JawDriver:
                     f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check"
                     " its mesh."
                 )
+        surface = held_surface(spec, observations, attempt.inputs, attempt.log)
         centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in observations.teeth]).mean(axis=0)
         channels, instrument = [], instrument_of(observations.manifest, spec, centre_mm)
         for name in spec.channels or observations.manifest.channels:
@@ -86,7 +88,7 @@ class JawDriver:
                     views,
                     write_channel(
                         attempt.inputs,
-                        channel_scene(observations, name, dentins, spec),
+                        channel_scene(observations, name, dentins, spec, surface=surface),
                         name,
                         views,
                         instrument=instrument,
@@ -113,7 +115,8 @@ class JawDriver:
             {c: jaw.fit.evaluation for c, jaw in fits.items()},
             {c: jaw.views for c, jaw in fits.items()},
         )
-        return report(spec, fits, order[0].name, dentins, observations, time.time() - begun)
+        told = report(spec, fits, order[0].name, dentins, observations, time.time() - begun)
+        return told.model_copy(update={"surface": surface})
 
 
 def require_jaw_options(spec: JobSpec) -> None:
