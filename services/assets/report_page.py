@@ -63,6 +63,7 @@ THIN_CAVEAT = (
     "The surface was modelled as a thin layer that does not bend light (teeth 2018). Its internal diffuse reflectance"
     " is 0.111 where a real surface of index 1.631 has 0.666, so fitted absorption 1 − α comes out 3 to 6 times too"
     " large (half space: 3 at 1 − α′ = 0.1, 5 at 0.01, limit 7) and is not comparable with the literature."
+    " With boundary = rough it is."
 )
 
 

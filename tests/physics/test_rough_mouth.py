@@ -9,7 +9,7 @@ import pytest
 
 from services.core.errors import InputError
 from services.transport.engine import Engine
-from services.transport.optics.parameters import Medium
+from services.transport.optics.parameters import Medium, Mouth, Tissue
 from tests.support.furnace import escaping_weights
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.rough_truths import MOUTH_INK, STORED, rough_mouth
@@ -57,3 +57,17 @@ def test_a_wall_behind_black_teeth_is_as_bright_as_without_a_surface() -> None:
 def test_gums_like_air_are_refused() -> None:
     with pytest.raises(InputError, match=r"gums_ior = 1 is too close to that of air for a rough surface"):
         Engine(replace(mouth_recipe("rough"), gums_ior=1.0))
+
+
+def test_aimed_connections_in_a_mouth_give_the_images_of_walks_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    # One tooth is fitted, and the other has its media. Lights through the gums and the neighbour are not aimed at.
+    scene, view = rough_mouth()
+    scene = replace(scene, teeth=scene.teeth[:1], neighbours=scene.teeth[1:], cavity=None, roughness=0.15)
+    clear = Medium(3.0, 0.99, g1=0.7)
+    mouth = Mouth((Tissue(clear, Medium(6.0, 0.98, g1=0.6)),), Medium(2.5, 0.9, g1=0.6))
+    aimed = Engine(scene, 2).images(mouth, view, samples=4096, seed=1, batches=BATCHES)
+    monkeypatch.setattr("services.transport.boundary.rough.Rough.aims", lambda *_: False)
+    alone = Engine(scene, 2).images(mouth, view, samples=8192, seed=2, batches=BATCHES)
+    shape = (len(aimed.mean), *view.camera.size[::-1])
+    means, variances = ([getattr(one, name).reshape(shape) for one in (aimed, alone)] for name in ("mean", "variance"))
+    require_same_pictures(pixel_scores(means, variances, block=2), least=48)

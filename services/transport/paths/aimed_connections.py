@@ -107,11 +107,12 @@ class AimedConnections(Connections):
         self.period = STEPS_PER_AIM
 
     def found(self, walker: Walker, flight: Flight, throughput: mi.Float) -> tuple[Vertex, mi.Bool]:
-        """Scattering vertices; they are kept in proportion to what may come through the nearest face, which is more
-        where they scatter towards it.
+        """Scattering vertices, in a mouth those of the fitted tooth below air; they are kept in proportion to what may
+        come through the nearest face, which is more where they scatter towards it.
         """
-        vertex, offered = super().found(walker, flight, throughput)
-        normal, depth_mm = self.mesh.nearest_face(vertex.point, offered)
+        vertex, _ = super().found(walker, flight, throughput)
+        normal, depth_mm = self.mesh.nearest_face(vertex.point, flight.scatters)
+        offered = flight.scatters & self.mesh.is_below_air(vertex.enclosure, depth_mm)
         medium = self._medium(vertex)
         depth = self._optical_depth(self._lengths(vertex, depth_mm, offered))
         g = BLUNTED * self.media.pick(self.media.g1, medium)
@@ -160,7 +161,8 @@ class AimedConnections(Connections):
         """
         to_border = dr.maximum(self.geometry.clearance(vertex.point, active), 0) + CLEARANCE_ERROR_MM
         below = dr.select(self._medium(vertex) == DENTIN, dr.minimum(to_border, depth_mm), 0)
-        return [depth_mm - below, below][: self.media.count]
+        others = [mi.Float(0) for _ in self.media.sigma[DENTIN:]]
+        return [depth_mm - below, below, *others][: len(self.media.sigma)]
 
     def _optical_depth(self, lengths_mm: list[mi.Float]) -> mi.Float:
         return sum((s * length for s, length in zip(self.media.sigma, lengths_mm, strict=True)), start=mi.Float(0))
@@ -295,7 +297,10 @@ class AimedConnections(Connections):
             flown.point = dr.select(hit.valid, self.geometry.advance(flown.point, omega, hit, hit.valid), flown.point)
             flown.normal = dr.select(outer, mi.Vector3f(hit.normal), flown.normal)
             flown.primitive = dr.select(outer, hit.primitive, flown.primitive)
-            flown.arrives |= outer & (flown.depth < DARK_DEPTH)
+            arrives = outer & (flown.depth < DARK_DEPTH)
+            if not self.geometry.single:
+                arrives &= ~hit.opaque & (self.geometry.medium(flown.enclosure) == 0)
+            flown.arrives |= arrives
             flown.alive &= hit.valid & ~outer & (flown.depth < DARK_DEPTH)
             return flown, omega
 

@@ -51,7 +51,7 @@ class ExitConnections(Connections):
         self.aims = (
             plan.shape is None
             and isinstance(geometry, MeshGeometry)
-            and geometry.single
+            and len(geometry.recipe.teeth) == 1
             and boundary.aims(lights.count)
         )
         self.period = STEPS_BESIDE_AIMED if self.aims else STEPS_PER_CONNECTION
@@ -67,7 +67,7 @@ class ExitConnections(Connections):
         if not geometry.single:
             normal = mi.Vector3f(hit.normal)
             within, outside = (geometry.beyond(walker.enclosure, towards, hit) for towards in (-normal, normal))
-            connects &= (geometry.medium(outside) == 0) & ~hit.opaque
+            connects = connects & (geometry.medium(outside) == 0) & ~hit.opaque
             ior = [geometry.index(self.faces.ior, within)]
         if geometry.stained:
             before = before * geometry.stain(hit, connects & leaving)

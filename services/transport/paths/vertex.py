@@ -20,7 +20,7 @@ class Leg:
     medium: mi.UInt32
     """Medium that scattered it."""
     scattered: mi.Bool
-    """Whether a medium did it, and no outer face."""
+    """Whether a medium did it, no outer face, where connections are aimed."""
 
     @staticmethod
     def none() -> Leg:

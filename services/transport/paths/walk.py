@@ -118,9 +118,8 @@ class Walk:
         flight = self._fly_past_faces(walker, throughput, tally) if self.plan.faces else self._fly(walker)
         throughput = self._throughput(walker)
         self._move(walker, flight, throughput)
-        if self.connections is not None:
-            self._connect(walker, flight, before, tally)
-        self._deflect(walker, flight)
+        aimed = [] if self.connections is None else self._connect(walker, flight, before, tally)
+        self._deflect(walker, flight, aimed)
         ended = self._end(walker, flight)
         if self.plan.most_steps is not None:
             ended = self._cut(walker, ended, self.plan.most_steps, tally)
@@ -243,14 +242,18 @@ class Walk:
             scattered_in = dr.select(flight.bounces, mi.UInt32(self.media.count), flight.medium)
         walker.scatterings = self.scores.scatter(walker.scatterings, scattered_in, flight.scatters | flight.bounces)
 
-    def _connect(self, walker: Walker, flight: Flight, before: mi.UInt64, tally: Tally) -> None:
-        """Offer vertices to the lane's reservoirs, and connect what these hold where that is due."""
+    def _connect(self, walker: Walker, flight: Flight, before: mi.UInt64, tally: Tally) -> list[mi.Bool]:
+        """Offer vertices to the lane's reservoirs, and connect what these hold where that is due; returns from which
+        lanes connections are aimed.
+        """
         assert self.connections is not None and walker.vertex is not None  # noqa: PT018
         throughput, rng = self._throughput(walker), walker.rng
         vertex, offered = self.connections.found(walker, flight, throughput)
         walker.vertex = self.connections.offer(walker.vertex, vertex, rng.next_float32(), offered)
+        aimed = []
         for aiming in self.aiming:
             vertex, offered = aiming.found(walker, flight, throughput)
+            aimed.append(offered)
             walker.aimed = [aiming.offer(walker.aimed[0], vertex, rng.next_float32(), offered)]
         self._keep_stream(walker, before)
         walker.connection_step += 1
@@ -262,8 +265,9 @@ class Walk:
         walker.rng = self.connections.connect(walker.vertex, walker.row, walker.rng, due, tally)
         walker.vertex.total = dr.select(due, 0, walker.vertex.total)
         walker.connection_step = dr.select(walker.connection_step == self.connections.period, 0, walker.connection_step)
+        return aimed
 
-    def _deflect(self, walker: Walker, flight: Flight) -> None:
+    def _deflect(self, walker: Walker, flight: Flight, aimed: list[mi.Bool]) -> None:
         phase, rng = PhaseFunction(self.media, flight.medium), walker.rng
         u_lobe = rng.next_float32() if self.media.two_lobes else None
         u, v = rng.next_float32(), rng.next_float32()
@@ -279,7 +283,7 @@ class Walk:
             walker.omega = dr.select(flight.bounces, diffuse, walker.omega)
         if walker.leg:
             turns = flight.scatters | (flight.meets & flight.hit.outer)
-            leg = Leg(walker.origin, walker.omega, flight.medium, flight.scatters)
+            leg = Leg(walker.origin, walker.omega, flight.medium, *aimed)
             walker.leg = [dr.select(turns, leg, walker.leg[0])]
         walker.omega = dr.select(flight.scatters, onward, walker.omega)
 

@@ -22,7 +22,7 @@ from services.transport.scene.clearance import Clearance
 from services.transport.scene.geometry import RAY_EPSILON, Hit
 from services.transport.scene.mitsuba_mesh import move_vertices, new_mesh
 from services.transport.scene.names import media_numbers
-from services.transport.scene.nearest_face import NearestFace, nearest_face_of
+from services.transport.scene.nearest_face import HIDDEN_MM, NearestFace, nearest_face_of
 from services.transport.scene.nesting import require_nested
 from services.transport.scene.recipe import SceneRecipe
 from services.transport.scene.stain_textures import StainTextures
@@ -175,12 +175,24 @@ class MeshGeometry:
         return self._clearance(point, active)
 
     def nearest_face(self, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
-        """Outward normal of the nearest part of a single tooth's outer face, and the depth below it in mm."""
+        """Outward normal of the nearest part of the first tooth's outer face, and the depth below it in mm."""
         return self._nearest_face(point, active)
+
+    def is_below_air(self, enclosure: mi.UInt32, depth_mm: mi.Float) -> mi.Bool:
+        """Whether a place lies in the first tooth, and air before its nearest face, by the depth that it has there."""
+        return mi.Bool(True) if self.single else (self.inside(enclosure) == 0) & (depth_mm < HIDDEN_MM)
 
     @cached_property
     def _nearest_face(self) -> NearestFace:
-        return nearest_face_of(self.recipe.teeth[0].outer)
+        outer = self.recipe.teeth[0].outer
+        return nearest_face_of(outer) if self.single else nearest_face_of(outer, self._fixed_mm, self._are_hidden)
+
+    def _are_hidden(self, points_mm: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.bool_]:
+        # A ray out of another solid meets that one's surface from behind; the wall of the mouth bounds none.
+        starts = np.ascontiguousarray((points_mm + 2 * self.epsilon * normals).T, dtype=np.float32)
+        direction = mi.Vector3f(np.ascontiguousarray(normals.T, dtype=np.float32))
+        hit = self.intersect(mi.Point3f(starts), direction, mi.UInt32(0), mi.Bool(True))
+        return np.array(hit.valid & ~hit.opaque & (dr.dot(hit.normal, direction) > 0))
 
     def inside(self, enclosure: mi.UInt32) -> mi.UInt32:
         """Number of the tooth whose tissue fills an enclosure; the number of teeth for gums, and one more outside of

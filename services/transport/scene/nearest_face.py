@@ -8,6 +8,7 @@ The scenes of one tooth that a process builds share a grid, which takes most of 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from hashlib import blake2b
 from weakref import WeakValueDictionary
 
@@ -29,25 +30,37 @@ SPACING_MM = 0.15
 MAX_BEND = 0.7
 """Cosine of the angle between neighbouring faces below which a normal is not smoothed over their common edge."""
 
+HIDDEN_MM = 1e6
+"""Depth in mm below parts of the surface that lie in gums or in another tooth, through which nothing is aimed."""
+
 _held: WeakValueDictionary[bytes, NearestFace] = WeakValueDictionary()
-"""Grids of the scenes that this process holds, by content of the surface."""
+"""Grids of the scenes that this process holds, by content of the surface and of what surrounds it."""
+Test = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
+"""Which points (N, 3) of a surface, with their outward normals (N, 3), lie hidden in another solid."""
 
 
-def nearest_face_of(mesh: Mesh) -> NearestFace:
-    """The grid of a surface, made unless another scene holds it."""
+def nearest_face_of(
+    mesh: Mesh, around_mm: NDArray[np.float64] | None = None, hidden: Test | None = None
+) -> NearestFace:
+    """The grid of a surface, made unless another scene holds it.
+
+    Args:
+        around_mm: vertices of what surrounds it, and ``hidden`` tells which parts lie in that; None for air alone.
+    """
     content = blake2b(repr((mesh.vertices_mm.shape, mesh.vertices_mm.dtype, mesh.faces.dtype)).encode())
-    for array in (mesh.vertices_mm, mesh.faces):
-        content.update(array.tobytes())
+    surroundings = b"" if around_mm is None else around_mm.tobytes()
+    for part in (mesh.vertices_mm.tobytes(), mesh.faces.tobytes(), surroundings):
+        content.update(part)
     found = _held.get(content.digest())
     if found is None:
-        found = _held[content.digest()] = NearestFace(mesh)
+        found = _held[content.digest()] = NearestFace(mesh, hidden)
     return found
 
 
 class NearestFace:
     """Smoothed normal of the nearest part of a closed surface, and the depth below the plane through that part."""
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: Mesh, hidden: Test | None = None) -> None:
         from scipy.spatial import cKDTree
 
         low, extent = mesh.vertices_mm.min(axis=0), np.ptp(mesh.vertices_mm, axis=0)
@@ -66,13 +79,15 @@ class NearestFace:
         sample = found[tuple(source)].reshape(-1)
         normals = _smoothed_normals(mesh)[owners]
         offsets = np.einsum("nk,nk->n", normals, points)
+        if hidden is not None:
+            offsets[hidden(points, normals)] = 2 * HIDDEN_MM
         columns = np.concatenate([normals, offsets[:, None]], axis=1)[sample]
         self._table = mi.Float(columns.astype(np.float32).reshape(-1))
         self._low = dr.opaque(mi.Point3f, low.tolist())
         dr.eval(self._table)
 
     def __call__(self, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
-        """Outward unit normal, and depth in mm, not negative."""
+        """Outward unit normal, and depth in mm, not negative; beyond ``HIDDEN_MM`` below hidden parts."""
         place = mi.Point3f(point - self._low) * (1 / self._cell_mm)
         x, y, z = (mi.UInt32(dr.clip(place[k], 0, int(self._shape[k]) - 1)) for k in range(3))
         cell = (x * int(self._shape[1]) + y) * int(self._shape[2]) + z
