@@ -225,13 +225,13 @@ def write_shell_scene(path: Path, scenes: dict[str, SceneDict]) -> str:
 def tissue_of(table: dict[str, Estimate]) -> Tissue:
     """Tissue of a table of estimates, of a tooth or an object; a part that was not modelled is an empty medium."""
     outer, inner = PARTS.values() if any(name.startswith("body.") for name in table) else PARTS
-    return Tissue(_medium_of(table, outer), _medium_of(table, inner))
+    return Tissue(medium_of(table, outer), medium_of(table, inner))
 
 
 def mouth_of(report: FitReport, channel: str) -> Mouth:
     """Mouth of a jaw's report in one channel, with the teeth in the report's order."""
     table = report.parameters[channel]
-    gums = _medium_of(table, "gums") if "gums.sigma" in table else None
+    gums = medium_of(table, "gums") if "gums.sigma" in table else None
     reflectance = table["cavity.reflectance"].value if "cavity.reflectance" in table else None
     return Mouth(tuple(tissue_of(tooth.parameters[channel]) for tooth in report.teeth.values()), gums, reflectance)
 
@@ -244,11 +244,12 @@ def media_of(report: FitReport) -> dict[str, dict[str, Medium]]:
         for channel, table in by_channel.items():
             for part in ("enamel", "dentin", "gums"):
                 if f"{part}.sigma" in table:
-                    found.setdefault(prefix + part, {})[channel] = _medium_of(table, part)
+                    found.setdefault(prefix + part, {})[channel] = medium_of(table, part)
     return found
 
 
-def _medium_of(table: dict[str, Estimate], part: str) -> Medium:
+def medium_of(table: dict[str, Estimate], part: str) -> Medium:
+    """Medium of a table of estimates by its part, such as ``enamel``; an empty one where it was not modelled."""
     values: dict[str, Any] = {
         field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table
     }

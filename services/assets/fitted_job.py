@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from services.core.files.meshes import read_mesh
 from services.core.geometry import Mesh
 from services.core.records import JobSpec
 from services.core.results import FitReport, PreparedManifest, ToothReport
@@ -43,6 +44,23 @@ class FittedJob:
     def teeth(self) -> tuple[Tooth, ...]:
         """The teeth with the fitted dentin surfaces."""
         return tuple(_with_dentin(*each) for each in self.shaped)
+
+    @property
+    def gums(self) -> Mesh | None:
+        """The gums that were rendered with the teeth."""
+        path, rendered = self.prepared_folder / "gums.ply", self.spec.kind == "jaw" or self.prepared.surroundings
+        return read_mesh(path) if rendered and path.is_file() else None
+
+    @property
+    def neighbours(self) -> tuple[Tooth, ...]:
+        """Teeth that were rendered around a single one, which no asset has."""
+        from services.anatomy.neighbours import read_neighbours, with_usual_dentin
+
+        if self.spec.kind != "tooth" or not self.prepared.surroundings:
+            return ()
+        (tooth,) = self.teeth
+        around = read_neighbours(self.prepared_folder, tooth)
+        return with_usual_dentin(tooth, around, self.prepared.cameras, self.spec)
 
     @cached_property
     def stains(self) -> ToothStains | None:

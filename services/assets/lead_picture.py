@@ -29,7 +29,6 @@ def write_lead_picture(
     job: FittedJob,
     cameras: tuple[Camera, ...],
     lights: tuple[Light, ...],
-    gums: Mesh | None = None,
     cavity: Mesh | None = None,
 ) -> tuple[str, ...]:
     """Write ``render_beside_photograph.png`` and ``colour_differences.json``, and return their names.
@@ -40,12 +39,12 @@ def write_lead_picture(
         folder: the asset's folder.
         job: the fitted job.
         cameras, lights: those of the asset, in its frame.
-        gums, cavity: of a jaw, what its teeth stand in and what is behind them.
+        cavity: of a jaw, what is behind its teeth.
     """
     if job.stains is not None:
         return ()
     radiance = StoredArray(job.prepared_folder / "prepared.zarr" / "radiance")
-    shown = Shown(job.teeth, cameras, lights, middle_of(job.teeth), gums, cavity)
+    shown = Shown(job.teeth, cameras, lights, middle_of(job.teeth), job.gums, cavity, job.neighbours)
     found = beside(job.spec, job.report, job.prepared, radiance, shown)
     if found is None:
         return ()

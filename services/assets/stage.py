@@ -88,7 +88,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         colours=CapturedColours(prepared.channels, prepared.colour) if prepared.colour else None,
     )
     write_record(writer.folder / PROVENANCE, provenance)
-    lead = write_lead_picture(writer.folder, job, cameras, lights, gums, cavity)
+    lead = write_lead_picture(writer.folder, job, cameras, lights, cavity)
     files = tuple(sorted((*files, PROVENANCE, *lead)))
 
     write_job_report(context.root / "report.html", job, writer.folder, provenance)

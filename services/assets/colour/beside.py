@@ -6,12 +6,12 @@ Light is additive, so the photographs under several lights make that under all o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.asset import mouth_of, tissue_of
+from services.assets.asset import medium_of, mouth_of, tissue_of
 from services.assets.colour.develop import CapturedColours, developed, diffuser_radiance
 from services.assets.colour.seen import Surfaces, seen
 from services.assets.colour.smoothing import smoothed_colours, smoothed_halves
@@ -21,6 +21,7 @@ from services.core.geometry import Camera, Light, Mesh, Tooth, Vector3
 from services.core.records import JobSpec
 from services.core.results import FitReport, PreparedManifest
 from services.core.store import StoredArray
+from services.transport.optics.parameters import Mouth, Tissue
 
 Floats = NDArray[np.float64]
 PATHS = 850_000
@@ -75,6 +76,8 @@ class Beside:
     """Whether a calibration tells the camera's colours; else its channels are taken for linear sRGB."""
     samples: int
     """Paths per pixel of the renders."""
+    has_surroundings: bool = False
+    """Whether the renders show gums and teeth around a single one, which its asset does not have."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +93,13 @@ class Shown:
     """Where the white diffuser is."""
     gums: Mesh | None = None
     cavity: Mesh | None = None
+    neighbours: tuple[Tooth, ...] = ()
+    """Teeth around a single one, which the fit took to have its media."""
 
     @property
     def surfaces(self) -> Surfaces:
         """What a camera may see."""
-        return Surfaces(self.teeth, self.gums, self.cavity)
+        return Surfaces(self.teeth, self.gums, self.cavity, self.neighbours)
 
 
 def beside(
@@ -152,7 +157,8 @@ def beside(
         )
 
     pairs = tuple(pair(choice, render) for choice, render in zip(choices, renders, strict=True))
-    return Beside(camera.name, pairs, colours is not None, samples)
+    around = bool(shown.neighbours) or (shown.gums is not None and not report.teeth)
+    return Beside(camera.name, pairs, colours is not None, samples, around)
 
 
 def square_means(values: Floats, edge: int) -> Floats:
@@ -193,6 +199,13 @@ def _photo(radiance: StoredArray, camera: int, light: int, crop: tuple[slice, sl
     return square_means(photo[: height * smaller, : width * smaller], smaller)
 
 
+def _media(report: FitReport, channel: str, shown: Shown) -> Mouth | Tissue:
+    if report.teeth:
+        return mouth_of(report, channel)
+    table = report.parameters[channel]
+    return replace(tissue_of(table), gums=None if shown.gums is None else medium_of(table, "gums"))
+
+
 def _renders(
     spec: JobSpec,
     report: FitReport,
@@ -211,9 +224,12 @@ def _renders(
     from services.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 
     order = [int(fdi) for fdi in report.teeth] or [tooth.fdi for tooth in shown.teeth]
-    teeth = tuple(
-        ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape.known(tooth.dentin))
-        for tooth in sorted(shown.teeth, key=lambda tooth: order.index(tooth.fdi))
+    teeth, neighbours = (
+        tuple(
+            ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape.known(tooth.dentin))
+            for tooth in group
+        )
+        for group in (sorted(shown.teeth, key=lambda tooth: order.index(tooth.fdi)), shown.neighbours)
     )
     pixels = np.argwhere(covered > 0)[:, ::-1].astype(np.int32)
     samples = max(1, round(paths / len(choices) / max(1, len(pixels))))
@@ -223,9 +239,10 @@ def _renders(
     intensities = np.pi * np.sum((positions - np.array(shown.middle_mm)) ** 2, axis=1)
     for k, channel in enumerate(RGB):
         recipe = SceneRecipe(
-            teeth, positions, intensities, spec.boundary, spec.ior, spec.device, gums=shown.gums, cavity=shown.cavity
-        )
-        tissue = mouth_of(report, channel) if report.teeth else tissue_of(report.parameters[channel])
+            teeth, positions, intensities, spec.boundary, spec.ior, spec.device, gums=shown.gums, cavity=shown.cavity,
+            neighbours=neighbours,
+        )  # fmt: skip
+        tissue = _media(report, channel, shown)
         engine = Engine(recipe.with_surface(report.surface))
         for image, choice in zip(images, choices, strict=True):
             view = View(film, pixels, tuple(choice.tolist()))

@@ -30,7 +30,7 @@ def picture(found: Beside, made_by: str) -> Image8:
     from PIL import Image, ImageDraw, ImageFont
 
     font, line = ImageFont.load_default(FONT_PX), round(1.35 * FONT_PX)
-    columns = [column for pair in found.pairs for column in _columns(pair, made_by)]
+    columns = [column for pair in found.pairs for column in _columns(pair, made_by, found.has_surroundings)]
     sentence = _sentence(found)
     height, width = columns[0][0].shape[:2]
     wide = max(width, *(int(font.getlength(text)) + 1 for _, caption in columns for text in caption))
@@ -48,13 +48,14 @@ def picture(found: Beside, made_by: str) -> Image8:
     return np.asarray(page)
 
 
-def _columns(pair: Pair, made_by: str) -> list[tuple[Image8, list[str]]]:
+def _columns(pair: Pair, made_by: str, has_surroundings: bool) -> list[tuple[Image8, list[str]]]:
     white = white_level(pair.photo.max(axis=-1), pair.photo.max(axis=-1) > DARK * pair.photo.max())
     times = max(1, pair.render.shape[0] // pair.photo.shape[0])
     lit = f"light {pair.lit}" if len(pair.lights) == 1 else pair.lit
     unseen = "which the fit has not seen" if pair.held_out else ""
     photo = tone_map(pair.photo, white).repeat(times, axis=0).repeat(times, axis=1)
-    shown = (photo, [made_by, lit, unseen]), (tone_map(pair.render, white), ["The asset in the", "same view and light"])
+    rendered = "The fit with gums and teeth around it," if has_surroundings else "The asset in the"
+    shown = (photo, [made_by, lit, unseen]), (tone_map(pair.render, white), [rendered, "same view and light"])
     return [(image, [text for text in caption if text]) for image, caption in shown]
 
 

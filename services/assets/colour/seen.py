@@ -25,12 +25,15 @@ class Surfaces:
     gums: Mesh | None = None
     cavity: Mesh | None = None
     """The wall of the mouth behind the teeth."""
+    neighbours: tuple[Tooth, ...] = ()
+    """Teeth around a single one, which the asset does not have."""
 
     @property
     def parts(self) -> tuple[tuple[Mesh, ...], ...]:
-        """Outer surfaces of all teeth, of the gums and of the wall, as far as there are any."""
-        rest = (mesh for mesh in (self.gums, self.cavity) if mesh is not None)
-        return (tuple(tooth.outer for tooth in self.teeth), *((mesh,) for mesh in rest))
+        """Outer surfaces of all teeth, of those around them, of the gums and of the wall, as far as there are any."""
+        around = tuple(tooth.outer for tooth in self.neighbours)
+        rest = [(mesh,) for mesh in (self.gums, self.cavity) if mesh is not None]
+        return tuple(tooth.outer for tooth in self.teeth), *([around] if around else []), *rest
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class Seen:
     teeth: Floats
     """Share (H, W) of each pixel that shows a tooth or the object."""
     part: NDArray[np.int64]
-    """Index (H, W) of the part that fills most of a pixel: 0 for teeth, then gums and wall; 0 where nothing is."""
+    """Index (H, W) of the part that fills most of a pixel, in the order of ``Surfaces.parts``; 0 where nothing is."""
 
     def by_part(self, of: Callable[[Floats, Floats], Floats], image: Floats) -> Floats:
         """Sum over the parts of ``of`` of an image (H, W, C) and of the covered share (H, W), each only where the part

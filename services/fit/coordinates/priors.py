@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from services.anatomy.neighbours import USUAL_WEIGHT
 from services.fit.coordinates.domain import HELD_G, similar_medium, to_dual
 from services.transport.optics.parameters import Medium
 
@@ -43,9 +44,8 @@ red and green."""
 GUMS_SD = {"sigma": 1.0, "alpha": 0.7}
 """Prior standard deviations of the gums' parameters about their start, in the unbounded domain; wide, because gums were
 never measured alone."""
-SHAPE = (0.6, 0.3)
-"""Prior of a blend weight: the weights nearest to the dentin of a micro-CT incisor and of procedural teeth lie at 0.3
-to 1."""
+SHAPE = (USUAL_WEIGHT, 0.3)
+"""Prior of a blend weight."""
 
 
 @dataclass(frozen=True)

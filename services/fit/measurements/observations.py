@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
+from services.anatomy.neighbours import read_neighbours
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.files.content_files import StoredFile
 from services.core.files.meshes import read_mesh, read_teeth
@@ -26,7 +27,6 @@ from services.fit.measurements.levels import LevelReader, reduced_camera, whole_
 from services.fit.measurements.pixel_step import chosen_pixel_step
 from services.fit.measurements.slopes import image_slopes
 from services.fit.measurements.smooth_functions import smooth_functions
-from services.fit.measurements.surroundings import read_neighbours
 from services.fit.measurements.view_stack import ViewStack, comparison_cells, on_coarse_grid
 from services.fit.solve.losses import first_weights
 from services.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
