@@ -160,7 +160,7 @@ def write_jaw_phantom(
             roughness, and an index of their own.
         seed: seed of the rendering and of the lights' brightness.
         samples: paths per pixel.
-        renderer: the project's engine, or stock Mitsuba for boundary ``matched`` and teeth that do not overlap.
+        renderer: the project's engine, or stock Mitsuba for a matched or rough boundary and teeth that do not overlap.
         lips: put lips and a retractor in front of the teeth, which cast shadows. A capture does not contain their
             surface; it is in ``truth_lips.ply``.
 

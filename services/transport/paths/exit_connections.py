@@ -89,12 +89,12 @@ class ExitConnections(Connections):
     def _prepared(self, vertex: Vertex, active: mi.Bool) -> Vertex:
         if not self.aims:
             return vertex
-        (facing,) = vertex.facing
-        (leg,) = facing.leg
+        (face,) = vertex.facing
+        (leg,) = face.leg
         aim = aim_of(self, leg.point, active)
         walks = WALKS_PER_AIM * PhaseFunction(self.media, leg.medium).density(leg.omega, vertex.omega)
         aim.walks = dr.select(leg.scattered, walks, 0)
-        return replace(vertex, facing=[replace(facing, leg=[], aim=[aim])])
+        return replace(vertex, facing=[replace(face, leg=[], aim=[aim])])
 
     def _look_up(self, light: mi.UInt32, vertex: Vertex, active: mi.Bool) -> LightView:
         return self.lights.maps.look_up(light, vertex.point, vertex.facing[0].primitive, active)
@@ -109,8 +109,8 @@ class ExitConnections(Connections):
 
     def _received(self, vertex: Vertex, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """What the face receives from a light, and the derivative of its logarithm to the roughness."""
-        (facing,) = vertex.facing
-        return self.faces.towards(vertex.omega, facing.normal, direction, *facing.ior)
+        (face,) = vertex.facing
+        return self.faces.towards(vertex.omega, face.normal, direction, *face.ior)
 
     def _terms(self, vertex: Vertex, direction: mi.Vector3f) -> dict[str, mi.Float]:
         if not any(score.field == "roughness" for score in self.plan.scores):
