@@ -1,6 +1,6 @@
 """Version of a fit's numerics; a checkpoint is continued only under the version that began it."""
 
-NUMERICS = 18
+NUMERICS = 19
 """Version of everything that decides the numbers of a fit: estimators, random streams, solvers, schedules. Raise it
 with every change after which the same job, data and seeds give results that differ by more than rounding. A fit that
 was begun under another version starts anew. ``tests/physics/test_numerics.py`` fails where the version should have been

@@ -285,6 +285,7 @@ def uncertainty(
     prior = t.T @ domain.precision @ t
     parts = {"photographs": misfit * positive_part(t.T @ equations.data_noise @ t)} | _prior_parts(domain, t)
     meat, weighing = parts["photographs"] + t.T @ domain.prior_noise @ t, np.zeros_like(prior)
+    solved: Response | None = None
     if sums is None:
         inverse = np.eye(count)
         parts["rendering"] = positive_part(t.T @ equations.gradient_noise @ t)
@@ -320,6 +321,8 @@ def uncertainty(
         domain, x, Sandwich(t, inverse, meat, misfit, weighing), parts, np.outer(remaining, remaining), part_count
     )
     unknown = _left_to_start(domain, whitened.undetermined_directions, combined.covariance)
+    if solved is not None:
+        unknown = unknown + _blurred(domain, t, solved, combined.covariance)
     covariance = 0.5 * (combined.covariance + combined.covariance.T) + unknown
     return Uncertainty(
         domain,
@@ -347,6 +350,24 @@ def _left_to_start(domain: Domain, directions: Array, covariance: Array) -> Arra
     alone = np.linalg.inv((own.T * precision) @ own)
     stated = directions.T @ (covariance / np.outer(scale, scale)) @ directions
     missing = directions @ positive_part(alone - stated) @ directions.T
+    return np.asarray(missing * np.outer(scale, scale))
+
+
+def _blurred(domain: Domain, t: Array, solved: Response, covariance: Array) -> Array:
+    """What a covariance (F, F) lacks along directions whose response lies below its noise.
+
+    There the response has its noise level, or a step would follow noise. The error is larger than that states: by as
+    much as the response is smaller, but no more than that of the fit's start.
+    """
+    count, scale = domain.tissue_count, domain.scale
+    missing = np.zeros_like(covariance)
+    for direction, ratio in zip(solved.blurred.T, solved.blurring, strict=True):
+        scaled = t @ direction / scale
+        scaled[count:] = 0.0
+        scaled /= np.linalg.norm(scaled)
+        stated = float(scaled @ (covariance / np.outer(scale, scale)) @ scaled)
+        start = 1 / float(np.maximum(domain.prior[1][:count] * scale[:count] ** 2, 1.0) @ scaled[:count] ** 2)
+        missing += max(min(stated * ratio**2, start) - stated, 0.0) * np.outer(scaled, scaled)
     return np.asarray(missing * np.outer(scale, scale))
 
 

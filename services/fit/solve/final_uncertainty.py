@@ -199,6 +199,11 @@ class Response:
     variance: Array
     excess: Array
     """E (F, F) after shrinkage."""
+    blurred: Array
+    """Unit directions (F, K) of the tissue along which M is smaller than its noise, so that ``inverse`` has the noise
+    level in its place."""
+    blurring: Array
+    """Noise level over M along each of them, (K,), above 1."""
 
 
 def response(sums: FinalSums, prior: Array, relation: NDArray[np.int_], errors: int = 0) -> Response:
@@ -229,15 +234,18 @@ def response(sums: FinalSums, prior: Array, relation: NDArray[np.int_], errors: 
     # could have made smaller ones.
     own, across, along = shrunk[:tissue, :tissue], shrunk[:tissue, tissue:], shrunk[tissue:, :tissue]
     u, values, v = np.linalg.svd(np.eye(tissue) + own - across @ along)
-    floor = 2 * np.sqrt(tissue * float(remaining[:tissue, :tissue].mean()))
-    of_tissue = v.T @ ((u / np.maximum(values, max(floor, 1e-6))).T)
+    floor = max(2 * np.sqrt(tissue * float(remaining[:tissue, :tissue].mean())), 1e-6)
+    of_tissue, is_blurred = v.T @ ((u / np.maximum(values, floor)).T), values < floor
     inverse = np.block(
         [
             [of_tissue, -of_tissue @ across],
             [-along @ of_tissue, np.eye(errors) + along @ of_tissue @ across],
         ]
     )
-    return Response(np.asarray(inverse), remaining, shrunk)
+    blurred = np.concatenate([v.T[:, is_blurred], np.zeros((errors, int(is_blurred.sum())))])
+    return Response(
+        np.asarray(inverse), remaining, shrunk, blurred, floor / np.maximum(values[is_blurred], 1e-3 * floor)
+    )
 
 
 def _between_variance(values: Array, noise: Array) -> float:
