@@ -2,8 +2,10 @@
 stock Mitsuba and fitted with the lights' strength given. Each image is of a camera and a light of its own. Stock
 Mitsuba loses light that meets several facets of a rough surface, so the fit does too.
 
-python -m tests.benchmarks.objects --shapes sphere,cube --lights 1,3 --boundaries matched,rough --json objects.json
+python -m tests.benchmarks.objects --shapes sphere,cube --lights 1,3 --boundaries matched --json matched.json
+python -m tests.benchmarks.objects --boundaries rough --samples 16384 --max-samples 16384 --json rough.json
 
+A shape may also be the file of a closed surface. Rough surfaces are noisy in stock Mitsuba and take more paths.
 Fits that the file holds already are not run again; another ``--samples`` or ``--max-samples`` needs another file.
 ``error`` and ``se`` are relative to the truth. A figure is reached when its error is below the limit, or below two
 standard errors where these exceed the limit, so that the images do not allow it.
