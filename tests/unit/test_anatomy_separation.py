@@ -123,3 +123,9 @@ def test_a_scene_has_a_medium_on_either_side_of_each_surface(tmp_path_factory: p
     assert [scene[name]["bsdf"].get("ior") for name in ("crown_11", "gums", "dentin_11")] == [1.631, 1.33, None]
     assert scene["root_11"]["bsdf"]["ior"] == pytest.approx(1.631 / 1.33)
     assert scene["cavity"]["bsdf"]["nested"]["reflectance"]["value"] == 0.3
+    rough = mouth_scene(files, (11, 12), mouth, (), (0, 0, 9), 1.0, boundary="rough", roughness=0.2)
+    faces = {name: rough[name]["bsdf"] for name in ("crown_11", "root_11", "gums")}
+    assert {name: face["int_ior"] for name, face in faces.items()} == pytest.approx(
+        {"crown_11": 1.631, "root_11": 1.631 / 1.33, "gums": 1.33}
+    )
+    assert {face["alpha"] for face in faces.values()} == {0.2}

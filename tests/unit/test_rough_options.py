@@ -51,6 +51,11 @@ def test_what_a_rough_surface_cannot_have_is_one_sentence(options: dict[str, Any
         job(**options)
 
 
+def test_a_tooth_has_its_surroundings_and_a_jaw_a_roughness_that_is_given() -> None:
+    assert job(surroundings="on").surroundings == "on"
+    assert job(kind="jaw", roughness=0.2).roughness == 0.2
+
+
 def test_others_keep_their_surroundings_and_stains() -> None:
     spec = job(boundary="thin", stains=True, surroundings="on", ior=1.0)
     assert (spec.stains, spec.surroundings) == (True, "on")

@@ -245,8 +245,6 @@ class MeshGeometry:
 
     def index(self, ior: mi.Float, enclosure: mi.UInt32) -> mi.Float:
         """Index of refraction at a place."""
-        if self.single:
-            return dr.select((enclosure & 1) != 0, ior, 1.0)
         tooth = self.inside(enclosure)
         return dr.select(tooth < self.teeth, ior, dr.select(tooth == self.teeth, self.recipe.gums_ior, 1.0))
 
